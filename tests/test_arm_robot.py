@@ -199,7 +199,7 @@ class TestExploring:
         asked = []
         stage.robot._confirm = lambda T: asked.append(T)
         (step,) = explore(stage.camera, stage.robot, config=self.SETTINGS)
-        assert step.stop == f"the robot could take none of 20 views: {UNCONFIRMED}"
+        assert step.stop == f"the robot refused 20 views in a row: {UNCONFIRMED}"
         assert len(asked) == 20
 
 

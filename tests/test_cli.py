@@ -218,7 +218,7 @@ def test_the_demo_says_view_by_view_what_it_found(tmp_path, capsys):
     assert " held by " in lines[1]
     assert lines[2].startswith("  next view: ")
     assert any(line.startswith("view 2: ") for line in lines)
-    assert "  done: 2 views were asked for" in lines
+    assert "  done: maximum of 2 views reached" in lines
     assert str(tmp_path / "run") in lines[-1]
     assert ESCAPE not in said.err
     assert (tmp_path / "run/report.html").is_file()
@@ -255,7 +255,7 @@ def test_without_early_stop_it_looks_until_the_views_are_used_up(tmp_path, recor
         for name, options in (("stops", ()), ("goes-on", ("--no-early-stop",)))
     )
     assert len(stops.views) == 2
-    assert stops.record["steps"][-1]["stop"] == "the last view changed nothing"
+    assert stops.record["steps"][-1]["stop"] == "the last view did not change the graph"
     assert len(goes_on.views) == 3
 
 

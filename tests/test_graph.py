@@ -24,7 +24,7 @@ GRAPH = SupportGraph(
 
 def test_objects_and_edges_are_found_by_ids_and_the_support_surface_by_its_role():
     assert GRAPH[object_id(2)].label == 2
-    with pytest.raises(KeyError, match="no object 'o9'; there are o0, o1, o2"):
+    with pytest.raises(KeyError, match="unknown object 'o9'; known objects: o0, o1, o2"):
         GRAPH["o9"]
     assert GRAPH.support_surface.id == SUPPORT_SURFACE_ID
     assert SupportGraph(GRAPH.objects[1:]).support_surface is None

@@ -241,7 +241,7 @@ def test_a_broken_image_is_left_out(tmp_path, views, capsys):
         (("--depth", DEPTH), "--info TOPIC is needed; topics with cameras: /camera/depth/camera_info; other"),
         (("--depth", "/chatter", "--info", INFO), "'/chatter' holds std_msgs/msg/String, not images"),
         ((*TOPICS, "--rgb", "/tf"), "--rgb: '/tf' holds tf2_msgs/msg/TFMessage, not images"),
-        ((*TOPICS, "--tf", "earth"), "no frame 'earth' in its transforms; there are base, map, optical"),
+        ((*TOPICS, "--tf", "earth"), "unknown frame 'earth'; known frames: base, map, optical"),
         ((*TOPICS, "--camera", "x.json"), "--camera: is for TUM RGB-D folders"),
         ((*TOPICS, "--set", "recording.min_readings=0.999"), "of its 3 depth images is usable: 3 too few"),
         ((*TOPICS, "--rgb", RGB, "--set", "recording.colour_gap=0.001"), "3 no colour image of that time"),

@@ -208,7 +208,7 @@ class TestCommands:
 
     def test_orders_that_cannot_be_are_errors(self, kept_run, tmp_path, capsys):
         assert run_command("order", kept_run, "--goal", "o9", *QUICK) == 1
-        assert "o9: is not an object of the graph; there are o1, o2" in capsys.readouterr().err
+        assert "o9: is not an object of the graph; known objects: o1, o2" in capsys.readouterr().err
         assert run_command("order", tmp_path, *QUICK) == 1
         assert "run.json" in capsys.readouterr().err
         assert run_command("order", kept_run, "--hands", 3) == 2

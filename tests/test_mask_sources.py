@@ -135,14 +135,14 @@ def test_what_gives_no_masks_is_refused(tmp_path, channels, capsys):
     with pytest.raises(InputError, match="has inputs picture, image and outputs masks"):
         mask_source(other, Config())
     assert run_command("config", "--masks", "onnx:model.onnx") == 1
-    assert "takes no views" in capsys.readouterr().err
+    assert "reads no views" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("source", "options", "said"),
     [
-        ("recording", ("--segmentation", "auto"), "--segmentation auto uses none"),
-        ("table.pcd", (), "is a cloud, which has no image for masks"),
+        ("recording", ("--segmentation", "auto"), "--segmentation auto, which uses no masks"),
+        ("table.pcd", (), "masks need images, and a cloud has none"),
     ],
 )
 def test_masks_that_would_not_be_used_are_refused(tmp_path, capsys, source, options, said):
@@ -182,7 +182,7 @@ def test_the_robots_own_arm_is_no_object(with_arm, tmp_path, capsys):
     for source, mask, said in (
         (with_arm / "arm", "small.png", "ignored is 240×54, depth is 240×180"),
         (with_arm / "arm", "none.png", "the file is missing"),
-        ("tower", "mask.png", "is simulated"),
+        ("tower", "mask.png", "simulated images do not show"),
     ):
         given = ("--ignore", with_arm / mask, "--out", tmp_path / "none")
         assert run_command("explore", source, *given) == 1

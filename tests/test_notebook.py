@@ -52,7 +52,7 @@ def shown(scene, steps, views):
         "scene": scene,
         "scene of nothing": ct.Scene(),
         "first step": steps[0],
-        "last step": replace(steps[1], decision=None, candidates=None, stop="2 views were asked for"),
+        "last step": replace(steps[1], decision=None, candidates=None, stop="maximum of 2 views reached"),
         "graph": scene.graph,
         "graph of nothing": ct.SupportGraph(),
         "object": scene.graph["o1"],
@@ -136,9 +136,9 @@ def test_facts_are_told(shown, scene, steps):
         "order": "not safe",
         "view": "160 × 120 px",
         "view of depth": "pose not known",
-        "scene of nothing": "nothing has been seen yet",
+        "scene of nothing": "no views yet",
         "first step": steps[0].decision.why,
-        "last step": "2 views were asked for",
+        "last step": "maximum of 2 views reached",
     }
     for name, fact in said.items():
         assert fact in words(shown[name]._repr_html_()), name

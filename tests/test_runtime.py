@@ -77,7 +77,7 @@ def test_two_processes_compile_each_kernel_once(tmp_path):
     ]
     said = [process.communicate(timeout=120)[1] for process in both]
     assert [process.returncode for process in both] == [0, 0], said
-    assert sorted(said) == ["", "compiling kernels, once after installation: about 20 seconds\n"]
+    assert sorted(said) == ["", "compiling kernels (once after installation, about 20 seconds)\n"]
     assert sorted(compiled.read_text().split()) == ["inner", "outer"]
 
 
@@ -160,7 +160,7 @@ def test_only_what_changed_and_what_calls_it_is_compiled_again(package, tmp_path
     (tmp_path / "c.py").write_text(SOURCE + "\n")
     compile_kernels()
     assert package == [[], ["c"], ["a", "b"]]
-    assert caplog.messages == ["compiling kernels, once after installation: about 20 seconds"] * 3
+    assert caplog.messages == ["compiling kernels (once after installation, about 20 seconds)"] * 3
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def test_what_has_no_depth_on_the_table_is_left_out_with_a_word(caplog):
     model_of([*views, replace(views[0], ignored=glass)], segmentation="auto")
     assert not caplog.messages
     model_of([replace(views[0], depth=np.where(glass, np.float32(0.0), views[0].depth))], segmentation="auto")
-    assert "no depth in 1 region over the table" in caplog.text
+    assert "no depth in 1 region above the table" in caplog.text
 
 
 def test_labels_are_those_of_the_vertices_and_of_the_table(tower):

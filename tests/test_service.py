@@ -89,7 +89,7 @@ def test_a_session_over_http_is_the_session(client, views):
     assert (again.status_code, again.json()) == (201, answers[1].json())
     wrong = client.post("/sessions/a/views", json=body(views[2], number=1))
     assert wrong.status_code == 409
-    assert "the next one is 2" in wrong.json()["detail"]
+    assert "the next view is 2" in wrong.json()["detail"]
 
     assert client.get("/sessions/a/graph").json() == graph_of(views[:2])
     assert client.get("/sessions").json() == {"sessions": ["a"]}
@@ -182,7 +182,7 @@ NOT_BEGUN = (
     ({"name": "b", "settings": {"recording": {"max_pixels": 10**9}}}, 422, "a limit of the service"),
     ({"name": "b", "settings": {"voxels": {"max_voxels": 10**9}}}, 422, "a limit of the service"),
     ({"name": "b", "seed": -1}, 422, "seed"),
-    ({"name": "a"}, 409, "holds a session or other files"),
+    ({"name": "a"}, 409, "contains a session or other files"),
 )
 
 
@@ -221,7 +221,7 @@ def test_what_is_not_there_is_said(client):
     for method, page in (("GET", ""), ("GET", "/graph"), ("GET", "/next"), ("DELETE", "/views/last")):
         answer = client.request(method, f"/sessions/no{page}")
         assert answer.status_code == 404
-        assert "no session 'no'" in answer.json()["detail"]
+        assert "unknown session 'no'" in answer.json()["detail"]
 
 
 def test_a_session_that_another_process_writes_is_busy(tmp_path, views):
@@ -229,7 +229,7 @@ def test_a_session_that_another_process_writes_is_busy(tmp_path, views):
         with Session.begin(tmp_path / "b") as session:
             answer = client.post("/sessions/b/views", json=body(views[0]))
             assert answer.status_code == 409
-            assert "another writer" in answer.json()["detail"]
+            assert "in use by another process" in answer.json()["detail"]
             assert session.views == 0
         assert client.post("/sessions/b/views", json=body(views[0])).status_code == 201
 
@@ -305,7 +305,7 @@ def test_this_machine_needs_no_token_and_every_other_address_demands_one(tmp_pat
     for host in ("0.0.0.0", "::", "192.168.0.7", "robot", "", "localhost.example"):
         check_token(host, TOKEN)
         assert run_command("serve", tmp_path / "s", "--host", host, "--port", 0) == 1
-        assert "there is no token; set CARYATID_TOKEN" in capsys.readouterr().err
+        assert "no token is set; set CARYATID_TOKEN" in capsys.readouterr().err
     assert run_command("serve", tmp_path / "s", "--token", "short") == 1
     assert "has fewer than 16 characters" in capsys.readouterr().err
     assert not (tmp_path / "s").exists()
@@ -316,7 +316,7 @@ def test_a_port_that_is_taken_is_said_in_one_line(tmp_path, capsys):
         port = taken.getsockname()[1]
         assert run_command("serve", tmp_path / "s", "--port", port) == 1
     said = capsys.readouterr().err
-    assert said.startswith(f"error: 127.0.0.1:{port}: cannot listen there (address already in use")
+    assert said.startswith(f"error: 127.0.0.1:{port}: cannot listen on it (address already in use")
     assert said.count("\n") == 1
 
 
@@ -333,7 +333,7 @@ def test_a_body_that_does_not_arrive_in_time_is_refused(client, monkeypatch):
 
     began = time.monotonic()
     answer = client.post("/sessions", content=trickle(), headers={"content-type": "application/json"})
-    assert (answer.status_code, answer.json()["detail"]) == (408, "the body did not arrive within 0.5 s")
+    assert (answer.status_code, answer.json()["detail"]) == (408, "the request body took longer than 0.5 s")
     assert time.monotonic() - began < 3.0
     assert len(sent) < 50
     assert client.post("/sessions", json={"name": "b"}).status_code == 201

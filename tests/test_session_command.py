@@ -65,7 +65,7 @@ def test_a_session_from_the_first_view_to_the_last(folder, files, capsys, views)
     assert run_command("session", "take", folder, "o2") == 0
     assert capsys.readouterr().out == "o2 removed: 1 object, 1 support\n"
     assert run_command("session", "take", folder, "o2") == 1
-    assert "not an object of the graph; there are o1" in capsys.readouterr().err
+    assert "not an object of the graph; known objects: o1" in capsys.readouterr().err
 
     for left in (2, 2, 1):
         assert run_command("session", "undo", folder) == 0
@@ -79,7 +79,7 @@ def test_a_robot_gives_the_poses_it_reaches(folder, files, capsys, views):
     assert run_command("session", "add", folder, *files(0)) == 0
     assert capsys.readouterr().out == "view 1: 2 objects, 2 supports\n"
     assert run_command("session", "add", folder, *files(1), "--number", 0) == 1
-    assert "the next one is 1" in capsys.readouterr().err
+    assert "the next view is 1" in capsys.readouterr().err
 
     path = folder.parent / "candidates.json"
     poses = [view.pose.tolist() for view in views[1:]]

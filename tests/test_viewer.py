@@ -219,7 +219,7 @@ def test_the_loop_gives_the_views_that_explore_gives_and_says_when_it_would_stop
     limited = replace(settings, active=replace(settings.active, max_views=2))
     page, source = LoopPage(opening, limited, segmentation="labels"), opening(limited)
     steps = explore(source.camera, source.robot, config=limited, segmentation="labels")
-    assert [page.turn() for _ in range(3)][:2] == [None, "2 views were asked for"]
+    assert [page.turn() for _ in range(3)][:2] == [None, "maximum of 2 views reached"]
     page.close()
     assert len(page.steps) == len(page.scores) == 3
     for step, shown, f1 in zip(steps, page.steps, page.scores, strict=False):

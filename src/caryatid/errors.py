@@ -1,4 +1,4 @@
-"""Errors that a user can remedy, each in one sentence."""
+"""Errors that a user can fix, each in one sentence."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class InputError(CaryatidError):
     """An input that cannot be used.
 
     Args:
-        source: The file, field or argument at fault.
+        source: The invalid file, field or argument.
         reason: What is wrong with it.
-        remedy: What the user can do about it.
+        remedy: How the user can fix it.
     """
 
     def __init__(self, source: str | PathLike[str], reason: str, remedy: str = "") -> None:
@@ -34,10 +34,10 @@ class InputError(CaryatidError):
 
 
 def check_type(name: str, value: object, wanted: str | type | tuple[type, ...], remedy: str) -> None:
-    """Refuse an argument of the wrong type, or without a method of this name.
+    """Reject an argument of the wrong type, or without a method of this name.
 
     Raises:
-        InputError: Names the argument and the type of what was given.
+        InputError: The type is wrong; the error names the argument and its type.
     """
     fits = hasattr(value, wanted) if isinstance(wanted, str) else isinstance(value, wanted)
     if not fits:
@@ -45,11 +45,11 @@ def check_type(name: str, value: object, wanted: str | type | tuple[type, ...], 
 
 
 class WrongViewError(InputError):
-    """A view whose camera or pose cannot be right; others may be."""
+    """A view whose camera or pose cannot be correct; other views may be usable."""
 
 
 class PerceptionError(CaryatidError):
-    """A view in which nothing can be perceived: no readings, or no support surface."""
+    """A view from which nothing can be extracted: no depth readings, or no support surface."""
 
 
 class NoSurfaceError(PerceptionError):
@@ -57,11 +57,11 @@ class NoSurfaceError(PerceptionError):
 
 
 class PlanningError(CaryatidError):
-    """No next view exists: none is reachable, or all have been visited."""
+    """No next view exists: none is reachable, or all were visited."""
 
 
 def missing_extra(extra: str, library: str, source: str | PathLike[str]) -> InputError:
-    """The error of a library that comes with an extra of the package and is not installed."""
+    """The error for a missing library that an extra of the package installs."""
     clone = Path(__file__).parents[2]
     package = clone if (clone / "pyproject.toml").is_file() else "caryatid"
     return InputError(source, f"needs {library}", f'{sys.executable} -m pip install "{package}[{extra}]"')
@@ -84,7 +84,7 @@ def needs_extra(extra: str, source: str | PathLike[str]) -> Iterator[None]:
 
 
 def in_one_line(error: Exception) -> str:
-    """Say what failed, and where, in one line."""
+    """Describe an error in one line."""
     match error:
         case CaryatidError():
             text = str(error)
@@ -97,5 +97,5 @@ def in_one_line(error: Exception) -> str:
         case MemoryError():
             text = f"out of memory: {error}"
         case _:
-            text = f"a fault in caryatid, {type(error).__name__}: {error}; --debug shows where"
+            text = f"internal error: {type(error).__name__}: {error}; run with --debug for the traceback"
     return " ".join(text.splitlines())

@@ -1,4 +1,4 @@
-"""The active vision loop: look, model, choose where to look next, go there (section IV)."""
+"""The active vision loop: take a view, update the model, plan the next view, go there (section IV)."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from caryatid.sensing.views import Camera, Cloud, View
 UNTIL = 0.95
 """Default probability at which the effects of removing the goal count as known [1]."""
 ATTEMPTS = 20
-"""Refusals by the robot in one step before the loop stops [1]; a coarse map is wrong in one of ten views."""
+"""Views that the robot may refuse in one step before the loop stops [1]; a coarse map errs in one of ten."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RobotPose:
-    """How a robot holds its camera.
+    """Posture of a robot at a view.
 
     Attributes:
         posture: Pose of the platform, or of an arm's base, and gaze.
@@ -63,7 +63,7 @@ class Step(Pictured):
             none, or no robot.
         labels: Label image (H, W) of the view, or labels (N,) of a cloud.
         graph: The fused graph after this view.
-        cloud: All points so far, thinned, with labels.
+        cloud: All points so far, downsampled, with labels.
         sphere: The view sphere of the robot.
         visited: Unit directions (V, 3) of the views so far from the sphere's centre.
         candidates: The views that could be reached next, or None if the loop stops.
@@ -72,7 +72,7 @@ class Step(Pictured):
         angle_travelled: Sum of the angles between consecutive views at the sphere's centre [rad].
         path_travelled: Path length [m] of a platform or of an arm's hand; without a robot, of the camera.
         stop: Why this is the last step, or None.
-        robot: How the robot holds its camera, or None if unknown.
+        robot: Posture of the robot, or None if unknown.
         changes: Changes of objects since the previous view, seen or reported.
         lift: The object removed after this view, or None.
     """
@@ -102,20 +102,20 @@ class Step(Pictured):
 
 
 class Explorer:
-    """Explores a scene one view at a time: `look()`, `plan()`, `go()`, and again.
+    """Explores a scene one view at a time: call `look()`, `plan()` and `go()` in turn.
 
-    Between any two calls the planner may be replaced (`use_planner`) or another view chosen (`choose`).
+    Between two calls, `use_planner` replaces the planner and `choose` replaces the next view.
 
     Args:
-        camera: Takes the views; None if they are passed to `look`.
-        robot: Stands where the first view is taken; None if nothing is planned.
+        camera: Camera that takes the views; None if they are passed to `look`.
+        robot: Robot, placed at the first view; None without planning.
         planner: Planner of the next view, or its name.
         config: Settings of all stages.
-        segmentation: `labels`, `auto`, or None to use labels where views have them.
+        segmentation: `labels`, `auto`, or None to use labels if available.
         seed: Seed of every random choice.
         masks: Source of masks, or None to use those of the views.
-        goal: Id of an object to remove, even if no view has shown it yet. Planner `support` then looks at
-            what its removal depends on, and the loop stops when that is known.
+        goal: Id of an object to remove, even if no view shows it yet. Planner `support` then looks at what
+            its removal depends on, and the loop stops when that is known.
         until: Probability [1], above 0.5, at which a support counts as known; with a goal, whether an object
             moves. The loop stops when all are known. None = 0.95 with a goal, otherwise never.
 
@@ -126,7 +126,7 @@ class Explorer:
         step: The newest step, or None before the first view.
 
     Raises:
-        InputError: There is no such planner, the masks would not be used, or `until` is out of range.
+        InputError: The planner is unknown, the masks would not be used, or `until` is out of range.
     """
 
     def __init__(
@@ -144,14 +144,14 @@ class Explorer:
     ) -> None:
         check_type("until", until, (float, int, NoneType), "give a probability, such as 0.95")
         if camera is not None:
-            check_type("camera", camera, "capture", "give a Camera: an object with its method capture()")
+            check_type("camera", camera, "capture", "give an object with the methods of Camera")
         if robot is not None:
-            check_type("robot", robot, "candidates", "give a Robot: an object with its methods")
+            check_type("robot", robot, "candidates", "give an object with the methods of Robot")
         if until is not None and not 0.5 < until <= 1.0:
             reason = f"{until:g} is not above 0.5 and at most 1"
             raise InputError("until", reason, "give a probability, such as 0.95")
         if masks is not None and segmentation == "auto":
-            raise InputError("masks", "are not used by segmentation auto", "leave out one of the two")
+            raise InputError("masks", "are not used by segmentation auto", "omit one of the two")
         self.scene = Scene(config, segmentation=segmentation, seed=seed)
         self._masks = masks
         self.goal = goal
@@ -162,42 +162,42 @@ class Explorer:
         self.use_planner(planner)
 
     def use_planner(self, planner: Planner | str) -> None:
-        """Use another planner, or its name, from now on.
+        """Replace the planner.
 
         Raises:
-            InputError: There is no such planner.
+            InputError: The planner is unknown.
         """
         self._planner = make_planner(planner)
 
     def look(self, given: View | Cloud | None = None) -> Step:
-        """Take a view where the robot stands and update the scene with it.
+        """Take a view from the robot's current pose, and update the scene with it.
 
         Args:
-            given: A view, or a cloud with z up, instead of one from the camera.
+            given: A view, or a cloud with z up, to use instead of the camera.
 
         Returns:
             The new step, without candidates and decision.
 
         Raises:
             NoSurfaceError: No support surface is known or visible. `scene` keeps a view that has a pose.
-            CaryatidError: The view cannot be used, or there is neither a view nor a camera.
+            CaryatidError: The view cannot be used, or neither a view nor a camera is given.
         """
         *_, step = self.looks(given)
         return step
 
     def looks(self, given: View | Cloud | None = None) -> Iterator[Step]:
-        """Look, and yield the steps of views kept so far, then that of the new one.
+        """Look, and yield the steps of the kept views, then the step of the new one.
 
         Args:
-            given: As of `look`.
+            given: As for `look`.
 
         Raises:
-            CaryatidError: As `look`.
+            CaryatidError: As for `look`.
         """
         watch = Stopwatch()
         if given is None:
             if self._camera is None:
-                raise PlanningError("there is no camera; pass the view to look()")
+                raise PlanningError("the explorer has no camera; pass a view to look()")
             given = self._camera.capture(self._moving().T_world_camera)
         if self._masks is not None and isinstance(given, View):
             given = self._masks(given)
@@ -237,10 +237,10 @@ class Explorer:
         """Choose the next view; if the robot refuses it after a closer check, choose among the others.
 
         Returns:
-            The newest step, with candidates and decision; if no view can be reached, `stop` says why.
+            The newest step, with candidates and decision; if no view is reachable, `stop` gives the reason.
 
         Raises:
-            PlanningError: Nothing has been seen yet, or there is no robot.
+            PlanningError: No view was taken yet, or the explorer has no robot.
         """
         step, robot = self._newest(), self._moving()
         watch = Stopwatch()
@@ -258,10 +258,10 @@ class Explorer:
         return self.step
 
     def reason_to_stop(self) -> str | None:
-        """After `plan`, say why another view may not pay, or None.
+        """After `plan`, return why another view may not be worth its path, or None.
 
         Raises:
-            PlanningError: Nothing has been seen yet.
+            PlanningError: No view was taken yet.
         """
         step = self._newest()
         if step.decision is None or step.candidates is None:
@@ -272,7 +272,7 @@ class Explorer:
         asked = until if goal is not None or step.index > 0 else None
         if asked is not None and settled(state.graph, goal, asked, state.voxels, config):
             what = "every support" if goal is None else f"what moves without {goal}"
-            return f"{what} is known with a probability of {asked:g}"
+            return f"{what} is known with probability {asked:g}"
         return reason_to_stop(state, self.scene.changed, self._planner, step.decision)
 
     def choose(self, chosen: Decision | int) -> Step:
@@ -282,10 +282,10 @@ class Explorer:
             chosen: A decision, or the index of one of the newest step's candidates.
 
         Returns:
-            The newest step, with this decision and the way there.
+            The newest step, with this decision and its waypoints.
 
         Raises:
-            PlanningError: There is no such candidate, the robot cannot take it, or nothing has been planned.
+            PlanningError: The candidate does not exist, the robot refuses it, or nothing was planned.
         """
         decision = self._by_hand(chosen) if isinstance(chosen, int) else chosen
         robot, T_world_camera = self._moving(), decision.T_world_camera
@@ -299,7 +299,7 @@ class Explorer:
     def _by_hand(self, index: int) -> Decision:
         step = self._newest()
         if step.decision is None or step.candidates is None or not 0 <= index < len(step.candidates):
-            raise PlanningError("there is no such view to choose")
+            raise PlanningError(f"candidate {index} does not exist; choose an index of step.candidates")
         rated = step.decision.candidate_saliency
         saliency = 0.0 if rated is None else float(rated[index])
         cost = float(path_cost(self._state(step.candidates))[index])
@@ -308,14 +308,14 @@ class Explorer:
         return replace(decision, saliency=saliency, cost=cost, score=score)
 
     def go(self) -> None:
-        """Send the robot to the next view.
+        """Move the robot to the next view.
 
         Raises:
-            PlanningError: There is none, or it cannot be reached.
+            PlanningError: No view is planned, or it cannot be reached.
         """
         step = self._newest()
         if step.decision is None:
-            raise PlanningError("there is no next view to go to")
+            raise PlanningError("no next view is planned; call plan() first")
         path = self._moving().move_to(step.decision.T_world_camera)
         self.step = replace(step, path_travelled=step.path_travelled + path)
 
@@ -332,12 +332,12 @@ class Explorer:
 
     def _moving(self) -> Robot:
         if self.robot is None:
-            raise PlanningError("there is no robot to move")
+            raise PlanningError("the explorer has no robot to move")
         return self.robot
 
     def _newest(self) -> Step:
         if self.step is None:
-            raise PlanningError("nothing has been seen yet; look first")
+            raise PlanningError("the scene has no views; call look() first")
         return self.step
 
 
@@ -354,25 +354,25 @@ def explore(
     until: float | None = None,
     early_stop: bool = True,
 ) -> Iterator[Step]:
-    """Look around until no view is expected to show more than its path costs, or `max_views` is reached.
+    """Explore until no view is worth its path, or `max_views` is reached.
 
     Args:
-        camera: Takes the views.
-        robot: Stands where the first view is taken.
+        camera: Camera that takes the views.
+        robot: Robot, placed at the first view.
         planner: Planner of the next view, or its name.
         config: Settings of all stages; `config.active.max_views` limits the views.
-        segmentation: `labels`, `auto`, or None to use labels where views have them.
+        segmentation: `labels`, `auto`, or None to use labels if available.
         seed: Seed of every random choice.
         masks: Source of masks, or None to use those of the views.
-        goal: As of `Explorer`.
-        until: As of `Explorer`.
+        goal: As for `Explorer`.
+        until: As for `Explorer`.
         early_stop: Whether to stop before `max_views`, by `config.active.stop` and `until`.
 
     Yields:
         A step after each view.
 
     Raises:
-        CaryatidError: A view cannot be used, or the planner does not exist.
+        CaryatidError: A view cannot be used, or the planner is unknown.
     """
     known: dict[str, Any] = {"config": config, "segmentation": segmentation, "seed": seed, "masks": masks}
     explorer = Explorer(camera, robot, planner=planner, goal=goal, until=until, **known)
@@ -385,7 +385,7 @@ def explore(
         if reason is not None:
             step = replace(step, candidates=None, decision=None, stop=reason)
         if step.stop is not None and goal is not None and all(o.id != goal for o in step.graph.objects):
-            step = replace(step, stop=f"{step.stop}; {goal} has not been found")
+            step = replace(step, stop=f"{step.stop}; {goal} was not found")
         yield step
         if step.decision is None:
             return
@@ -393,7 +393,7 @@ def explore(
 
 
 def reason_to_stop(state: PlanningState, changed: bool, planner: Planner, decision: Decision) -> str | None:
-    """Say why another view may not pay, or None.
+    """Return why another view may not be worth its path, or None.
 
     Args:
         state: The state that the planner used.
@@ -404,15 +404,15 @@ def reason_to_stop(state: PlanningState, changed: bool, planner: Planner, decisi
     if len(state.visited) == 1:
         return None
     if state.config.stop == "unchanged":
-        return None if changed else "the last view changed nothing"
+        return None if changed else "the last view did not change the graph"
     if not isinstance(planner, SupportPlanner):
         decision = SupportPlanner().plan(state, np.random.default_rng(0))
-    return "no view is expected to show more than its path costs" if decision.score <= 0.0 else None
+    return "no further view is worth its path" if decision.score <= 0.0 else None
 
 
 def used_up(views: int, config: ActiveVisionConfig) -> str | None:
-    """Say that no more than so many views were asked for, or None."""
-    return f"{views} views were asked for" if views >= config.max_views else None
+    """Return that the maximum number of views is reached, or None."""
+    return f"maximum of {views} views reached" if views >= config.max_views else None
 
 
 def next_best_view(
@@ -428,7 +428,7 @@ def next_best_view(
 
     Args:
         scene: Scene model of at least one view.
-        robot: Robot that has to reach the view; None if `candidates` are given.
+        robot: Robot that must reach the view; None if `candidates` are given.
         visited: Unit directions (V, 3) of earlier views from the centre of the robot's view sphere, the
             current one last; None = those of the scene, or the robot's if they have no poses.
         candidates: Camera poses (N, 4, 4) to choose from; None = those the robot reaches.
@@ -437,17 +437,17 @@ def next_best_view(
 
     Returns:
         The decision: `T_world_camera` is the view, `index` its index among the candidates, `waypoints` the
-        way there, `why` the reason.
+        path to it, `why` the reason.
 
     Raises:
-        InputError: The candidates are not poses, or path lengths do not fit them.
-        PlanningError: The scene has no view yet, or no view can be reached.
+        InputError: The candidates are not poses, or differ in number from the path lengths.
+        PlanningError: The scene has no view yet, or no view is reachable.
     """
-    check_type("scene", scene, Scene, "give a Scene that has seen a view")
+    check_type("scene", scene, Scene, "give a Scene with at least one view")
     if scene.sphere is None:
-        raise PlanningError("nothing has been seen yet; update the scene with a first view")
+        raise PlanningError("the scene has no views; update it with a first view")
     if robot is None and candidates is None:
-        raise PlanningError("there is no robot; give the poses to choose from as candidates")
+        raise PlanningError("neither a robot nor candidates are given; give one of them")
     if robot is not None:
         check_type("robot", robot, "candidates", "give a Robot, or None with candidates")
     sphere, poses = view_sphere_of(robot, scene.sphere), scene.T_world_cameras
@@ -455,7 +455,7 @@ def next_best_view(
         poses = (robot.T_world_camera,)
     if visited is None:
         if not poses:
-            raise PlanningError("no view had a camera pose; give visited, the directions of the views so far")
+            raise PlanningError("no view has a camera pose; give visited, the directions of earlier views")
         visited = sphere.direction_of(np.stack(poses))
     if np.ndim(visited) != 2 or np.shape(visited)[1] != 3:
         raise InputError("visited", f"has shape {np.shape(visited)}", "give unit directions (V, 3)")
@@ -470,7 +470,7 @@ def next_best_view(
 def given_candidates(
     poses: ArrayLike, path_length: ArrayLike | None, T_world_camera: Array | None, sphere: ViewSphere
 ) -> Candidates:
-    """Check camera poses that a robot whose camera is at a pose (4, 4) can reach.
+    """Check camera poses that a robot can reach from its camera pose (4, 4).
 
     Raises:
         InputError: They are not poses (N, 4, 4), or path lengths (N,) [m] differ in number or are negative.
@@ -479,7 +479,7 @@ def given_candidates(
         named = enumerate(np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4))
         lengths = None if path_length is None else np.asarray(path_length, dtype=np.float64)
     except (TypeError, ValueError):
-        remedy = "give camera poses (N, 4, 4), and a path length (N,) [m] for each if they are known"
+        remedy = "give camera poses (N, 4, 4) and, optionally, a path length (N,) [m] for each"
         raise InputError("candidates", "are not an array of poses", remedy) from None
     rigid = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in named]).reshape(-1, 4, 4)
     if lengths is None:
@@ -505,10 +505,10 @@ def _decide(
             return decision.with_waypoints(waypoints), state.candidates
         why = refused.reason
         state = replace(state, candidates=state.candidates.without(decision.index, why))
-    raise PlanningError(f"the robot could take none of {ATTEMPTS} views: {why}")
+    raise PlanningError(f"the robot refused {ATTEMPTS} views in a row: {why}")
 
 
 def _state(scene: Scene, sphere: ViewSphere, visited: Array, candidates: Candidates) -> PlanningState:
     if scene.voxels is None:
-        raise PlanningError("nothing has been seen yet; update the scene with a first view")
+        raise PlanningError("the scene has no views; update it with a first view")
     return PlanningState(scene.graph, sphere, scene.voxels, visited, candidates, scene.config.active)

@@ -127,7 +127,9 @@ class SupportGraph(Pictured):
         for candidate in self.objects:
             if candidate.id == object_id:
                 return candidate
-        raise KeyError(f"no object '{object_id}'; there are {', '.join(o.id for o in self.objects)}")
+        raise KeyError(
+            f"unknown object '{object_id}'; known objects: {', '.join(o.id for o in self.objects)}"
+        )
 
     @property
     def support_surface(self) -> SceneObject | None:

@@ -44,20 +44,20 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 KEPT = "%s; this view is kept until a later one shows the table top"
-"""What is logged of a view without a support surface."""
+"""Log message for a view without a support surface."""
 
-LEFT_OUT = "%s; the view is left out"
-"""What is logged of a view that cannot be right."""
+LEFT_OUT = "%s; the view is ignored"
+"""Log message for a view that cannot be correct."""
 
 
 class Scene(Pictured):
     """The scene model of section III, updated view by view.
 
-    The first one after installation takes longer, because kernels are compiled.
+    The first scene after installation takes longer, because kernels are compiled.
 
     Args:
-        config: All stages' settings.
-        segmentation: `labels` requires them in every view, `auto` ignores them, None uses them where given.
+        config: Settings of all stages.
+        segmentation: `labels` requires them in every view, `auto` ignores them, None uses them if available.
         seed: Seed of every random choice; the same seed and views give the same model.
 
     Attributes:
@@ -67,22 +67,22 @@ class Scene(Pictured):
         voxels: Free, occupied and unknown space, or None before that view.
         sphere: The view sphere around the table top, or None before that view.
         T_world_camera: Pose (4, 4) of the newest view after registration, or None for a cloud.
-        T_world_cameras: Poses (4, 4) of all views so far, each as it was when the view was new.
+        T_world_cameras: Poses (4, 4) of all views so far, each as registered when the view was new.
         views: Number of views in the model.
         waiting: Views kept until a later one shows the support surface.
         changed: Whether the newest view changed the graph.
-        timings: Seconds the stages of the newest update took.
+        timings: Time of each stage of the newest update [s].
     """
 
     def __init__(
         self, config: Config | None = None, *, segmentation: SegmentationMethod | None = None, seed: int = 0
     ) -> None:
         check_type("config", config, (Config, NoneType), "give a caryatid.Config")
-        check_type("seed", seed, (int, np.integer), "give a whole number of at least 0")
+        check_type("seed", seed, (int, np.integer), "give an integer of at least 0")
         if segmentation not in (None, "labels", "auto"):
-            raise InputError("segmentation", f"'{segmentation}' is not known", "choose labels, auto or None")
+            raise InputError("segmentation", f"'{segmentation}' is unknown", "choose labels, auto or None")
         if seed < 0:
-            raise InputError("seed", f"is {seed}", "give a whole number of at least 0")
+            raise InputError("seed", f"{seed} is negative", "give an integer of at least 0")
         compile_kernels()
         self.config = config or Config()
         self.segmentation = segmentation
@@ -117,7 +117,7 @@ class Scene(Pictured):
 
     @property
     def cloud(self) -> Cloud:
-        """All points so far, thinned view by view, with the labels of their objects."""
+        """All points so far, downsampled view by view, with the labels of their objects."""
         return self._models.points.everything()
 
     def __repr__(self) -> str:
@@ -125,7 +125,7 @@ class Scene(Pictured):
         return f"Scene(views={self.views}, vertices={vertices}, edges={edges})"
 
     def explain(self, supporter: str, supported: str) -> str:
-        """Say why one object supports another, or why not, with figures.
+        """Explain why one object supports another, or why not, with numbers.
 
         Args:
             supporter: Id of an object, such as `o1`.
@@ -134,32 +134,32 @@ class Scene(Pictured):
         return explain(self.graph, supporter, supported, self.config.support)
 
     def predict_removal(self, object_id: str) -> tuple[Effect, ...]:
-        """Say which objects move when one is removed, how likely, and why.
+        """Predict which objects move when one is removed, with probability and reason.
 
         Args:
             object_id: Id of an object, such as `o3`.
 
         Raises:
-            InputError: There is no such object, or it is the support surface.
+            InputError: The object is unknown, or it is the support surface.
         """
         return predict_removal(self.graph, object_id, self.config.support)
 
     def show(self) -> Any:
-        """Open the viewer: a page in the browser, which a notebook shows in its cell.
+        """Open the viewer in the browser, or in the cell of a notebook.
 
         Returns:
             A handle with the page's `url`; `update(scene)` adds the scene's current state, `close()` ends it.
 
         Raises:
-            InputError: viser, which the extra `view` brings, is not installed; or no port is free.
+            InputError: viser (extra `view`) is not installed, or no port is free.
         """
         return call("viewer", self)
 
     def copy(self) -> Scene:
         """Return an independent copy.
 
-        Both continue alike: the same views give the same graphs. Data that no update changes in place is
-        shared, so a copy costs almost nothing.
+        Both give the same graphs for the same further views. Data that no update changes in place is shared,
+        so a copy costs almost nothing.
         """
         other = copy.copy(self)
         other._models = self._models.copy()
@@ -168,7 +168,7 @@ class Scene(Pictured):
         return other
 
     def removed(self, object_id: str) -> SupportGraph:
-        """Report that an object was removed; the model forgets it, and its old place is unknown.
+        """Report that an object was removed; the model deletes it, and its space becomes unknown.
 
         Args:
             object_id: Id of an object, such as `o3`.
@@ -177,24 +177,24 @@ class Scene(Pictured):
             The graph without it.
 
         Raises:
-            InputError: There is no such object, or it is the support surface.
+            InputError: The object is unknown, or it is the support surface.
         """
         self._forget(self._object(object_id))
         self._reported("removed", object_id)
         return self.graph
 
     def moved(self, object_id: str, T: Array) -> SupportGraph:
-        """Report that an object was moved; its points and shape move along, and its supports are found again.
+        """Report that an object was moved; its points and shape move too, and its supports are recomputed.
 
         Args:
             object_id: Id of an object, such as `o3`.
-            T: Rigid transform (4, 4) of the world that takes it from where it was to where it is.
+            T: The object's motion as a rigid transform (4, 4) in the world frame.
 
         Returns:
-            The graph with it where it is now.
+            The graph with the object at its new pose.
 
         Raises:
-            InputError: There is no such object, it is the support surface, or T is not a rigid transform.
+            InputError: The object is unknown, it is the support surface, or T is not a rigid transform.
         """
         self._forget(self._object(object_id), transforms.as_rigid(T, "T"))
         self._reported("moved", object_id)
@@ -210,10 +210,10 @@ class Scene(Pictured):
             Id of the new object.
 
         Raises:
-            InputError: No view is known yet.
+            InputError: The scene has no views.
         """
         if self.voxels is None:
-            raise InputError("scene", "has no views", "look first")
+            raise InputError("scene", "has no views", "add a view first")
         label = self._models.put(shape, self.views - 1)
         self.voxels = self.voxels.forgotten(self.voxels.within(shape, np.zeros((0, 3))))
         self._reported("added", object_id(label))
@@ -223,13 +223,13 @@ class Scene(Pictured):
         """The object with this id.
 
         Raises:
-            InputError: There is none, or it is the support surface.
+            InputError: The id is unknown, or it is the support surface.
         """
         for o in self.graph.objects:
             if o.id == object_id and o.role == "object":
                 return o
         known = ", ".join(o.id for o in self.graph.objects if o.role == "object")
-        raise InputError(object_id, "is not an object of the graph", f"there are {known or 'none'}")
+        raise InputError(object_id, "is not an object of the graph", f"known objects: {known or 'none'}")
 
     def _forget(self, o: SceneObject, T: Array | None = None) -> None:
         """Forget an object, or move its points and shape by T; its supports are dropped."""
@@ -270,13 +270,13 @@ class Scene(Pictured):
     def update(self, source: View | Cloud) -> SupportGraph:
         """Add one view, or one cloud with z up, and return the fused graph.
 
-        A view with a pose that shows no support surface is kept with a warning, until a view shows one. Kept
+        A view with a pose but without a support surface is kept, with a warning, until a view shows one. Kept
         views are then added first.
 
         Raises:
             InputError: Required labels are missing, or a later view has no pose.
-            WrongViewError: The camera or its pose cannot be right; nothing has changed.
-            PerceptionError: There are no readings; or no support surface, and no pose.
+            WrongViewError: The camera or its pose cannot be correct; the scene does not change.
+            PerceptionError: The view has no readings; or no support surface, and no pose.
         """
         kept = len(self.waiting)
         try:
@@ -289,11 +289,11 @@ class Scene(Pictured):
         return self.graph
 
     def updates(self, source: View | Cloud) -> Iterator[View | Cloud]:
-        """Add one view or cloud, after the views kept; yields each when it is part of the model.
+        """Add one view or cloud, after the kept views; yield each when it is part of the model.
 
         Raises:
-            NoSurfaceError: There is no support surface. A view with a pose is kept all the same.
-            CaryatidError: As `update`.
+            NoSurfaceError: The view shows no support surface; if it has a pose, it is kept.
+            CaryatidError: As for `update`.
         """
         check_type("source", source, (View, Cloud), "give a View or a Cloud")
         if isinstance(source, View):
@@ -337,7 +337,7 @@ class Scene(Pictured):
         before = self.voxels
         missing, new = self._changes_seen(observation, named)
         if self.surface and before and self._registration and observation.view:
-            # Where everything it shows would have changed, its pose is wrong rather.
+            # If everything it shows had changed, the pose would be wrong instead.
             explained = list(new) if set(observation.shown) - new.keys() - {0, SUPPORT_LABEL} else []
             unexplained = observation.cloud.points_world[~np.isin(observation.labels, explained)]
             aligned = self._registration.aligned
@@ -374,7 +374,7 @@ class Scene(Pictured):
         self.timings = watch.laps
 
     def _named(self, source: View | Cloud) -> bool:
-        """Whether a label means the same object in all views."""
+        """Whether a label identifies the same object in all views."""
         if isinstance(source, View) and source.labels_are == "segments":
             return False
         return self.config.fusion.matching == "points" and self.config.fusion.masks == "scene"
@@ -384,8 +384,8 @@ class Scene(Pictured):
         wrong, shown = self._models.mislabelled(observation)
         if 2 * wrong > shown:
             log.warning(
-                "%s: %d of %d masks lie on objects that had other numbers; if a number means nothing in "
-                'another view, use --masks per-view or View(labels_are="segments")',
+                "%s: %d of %d masks lie on objects that had other numbers; if each view has its own numbers, "
+                'use --masks per-view or View(labels_are="segments")',
                 name, wrong, shown,
             )  # fmt: skip
 
@@ -394,7 +394,7 @@ class Scene(Pictured):
         (height, width), (rows, columns) = source.depth.shape, used.depth.shape
         if not self.views and rows < height:
             log.info(
-                "%s: %d×%d of %d×%d pixels are used, as near to each other as cloud.voxel asks for",
+                "%s: using %d×%d of %d×%d pixels, at the spacing of cloud.voxel",
                 source.name, columns, rows, width, height,
             )  # fmt: skip
 
@@ -403,8 +403,8 @@ class Scene(Pictured):
         holes = count_holes(view, surface, self.config.segmentation)
         if holes:
             log.warning(
-                "%s: no depth in %s over the table (transparent, black or shiny things?); "
-                "objects there are missed",
+                "%s: no depth in %s above the table (transparent, black or shiny objects?); "
+                "objects there will be missed",
                 view.name, "1 region" if holes == 1 else f"{holes} regions",
             )  # fmt: skip
 
@@ -414,19 +414,17 @@ class Scene(Pictured):
             low, high = self.config.segmentation.clearance, self.config.surface.storey
             over = observation.surface.over(observation.cloud.points_world, low, high, 0.0)
             if over.sum() >= self.config.segmentation.min_size:
-                remedy = (
-                    "no mask shows what they are" if masks else "go nearer, or give a larger image or masks"
-                )
-                log.warning("%s: no object among %d points over the table; %s", name, over.sum(), remedy)
+                remedy = "no mask covers them" if masks else "move closer, or give a larger image or masks"
+                log.warning("%s: no object in %d points above the table; %s", name, over.sum(), remedy)
 
     def _registered(self, observation: Observation, named: bool) -> tuple[Observation, set[int]]:
-        """Register the view to the earlier ones, and move those by what it shows.
+        """Register the view to the earlier ones, and correct their poses too.
 
         Returns:
-            The observation, moved, and the labels of the objects with moved points.
+            The registered observation, and the labels of the objects with moved points.
 
         Raises:
-            WrongViewError: Its pose cannot be right; nothing has changed.
+            WrongViewError: The pose cannot be correct; the scene does not change.
         """
         config = self.config
         if not config.registration.enabled:
@@ -500,11 +498,11 @@ class Scene(Pictured):
         return observation.relabelled(dict(given_up))
 
     def _changes_seen(self, observation: Observation, named: bool) -> tuple[dict[str, str], dict[int, str]]:
-        """Find objects that changed, and forget them before anything is added.
+        """Find objects that changed, and delete them before anything is added.
 
         Returns:
-            Ids of the objects that are not where they were, and labels of the segments that are where space
-            was free; each with why.
+            Ids of the objects that are no longer in place, and labels of the segments in space that was free;
+            each with a reason.
         """
         view, voxels, registration = observation.view, self.voxels, self._registration
         if view is None or voxels is None or (registration and not registration.aligned):
@@ -546,7 +544,7 @@ class Scene(Pictured):
     def _reidentified(
         self, observation: Observation, new: dict[int, str]
     ) -> tuple[Observation, dict[int, str]]:
-        """Give what is new the labels of the objects that are missing, where the shapes are alike."""
+        """Give new segments the labels of missing objects with similar shapes."""
         new = {k: why for k, why in new.items() if k in self._models.fits}
         found = self._detector.found_again(self._models.fits, new, self._label_of)
         for old, label in found.items():
@@ -594,7 +592,7 @@ class Stopwatch:
         self._started = perf_counter()
 
     def lap(self, stage: str) -> None:
-        """End a stage; the next one starts now."""
+        """End a stage and start the next one."""
         now = perf_counter()
         self.laps[stage] = self.laps.get(stage, 0.0) + now - self._started
         self._started = now

@@ -1,4 +1,4 @@
-"""Sessions over HTTP, for robot software elsewhere: `caryatid serve`.
+"""Sessions over HTTP, for robot software in any language: `caryatid serve`.
 
 One thread handles the requests in turn. A view already uses all cores in compiled loops, and not every
 threading layer of numba allows two threads at once, so more threads would gain nothing.
@@ -46,11 +46,11 @@ from caryatid.sessions.session import Added, SessionConflictError
 
 
 class FullError(CaryatidError):
-    """The service takes nothing more at present."""
+    """The service is at a limit and accepts no more data at present."""
 
 
 class MissingError(CaryatidError):
-    """There is no session of this name."""
+    """No session has this name."""
 
 
 STATUS: dict[type[Exception], int] = {
@@ -77,9 +77,9 @@ class Document(BaseModel):
 
 
 class Problem(Document):
-    """What went wrong, in one sentence."""
+    """An error, in one sentence."""
 
-    detail: str = Field(description="What, where, and what can be done about it")
+    detail: str = Field(description="Input at fault, reason and remedy")
 
 
 class SessionOptions(Document):
@@ -89,18 +89,19 @@ class SessionOptions(Document):
     segmentation: SegmentationMethod | None = Field(
         None, description="Source of segments; null = labels if the first view has them"
     )
-    seed: int = Field(0, ge=0, le=2**63 - 1, description="Seed of every random choice")
+    seed: int = Field(0, ge=0, le=2**63 - 1, description="Random seed")
     planner: str = Field("support", description="Planner of the next view")
 
 
 class NewSession(SessionOptions):
-    """A session to begin."""
+    """A session to create."""
 
     settings: dict[str, dict[str, Any]] = Field(
-        {}, description="As `caryatid config --json` lists them: stage → name → value"
+        {}, description="Settings to change, as in `caryatid config --json`: stage → name → value"
     )
     ignore: Base64Bytes | None = Field(
-        None, description="Grey PNG whose pixels other than 0 are ignored in every view: the robot's own arm"
+        None,
+        description="Grey PNG of pixels to ignore in every view, such as the robot's arm; 0 = keep",
     )
 
 
@@ -111,18 +112,18 @@ class SessionAnswer(SessionOptions):
 
 
 class NewView(Document):
-    """A view, with its images as files in base64."""
+    """A view, with image files in base64."""
 
-    camera: CameraRecord = Field(description="Camera and pose of the view")
+    camera: CameraRecord = Field(description="Camera matrix and camera pose")
     depth: Base64Bytes = Field(description="16-bit PNG, or .npy (H, W) of floats in metres; 0 = no reading")
     rgb: Base64Bytes | None = Field(None, description="PNG, JPEG, or .npy (H, W, 3) of uint8")
     labels: Base64Bytes | None = Field(
-        None, description="Grey PNG, or .npy (H, W) of whole numbers: the object of each pixel, 0 = nothing"
+        None, description="Grey PNG, or .npy (H, W) of integers: the object of each pixel, 0 = no object"
     )
     number: int | None = Field(
         None,
         ge=0,
-        description="Expected number of the view, from 0; the last view is not added a second time",
+        description="Number of the view, from 0; makes retries safe: the last view is not added twice",
     )
 
     def capture(self) -> Capture:
@@ -146,11 +147,12 @@ class ViewAnswer(Document):
 
 
 class NewReport(Document):
-    """What the robot did to an object: T (4, 4) moved it, or without T it was taken away."""
+    """An object that the robot removed, or moved by T (4, 4)."""
 
-    object: str = Field(description="Its id")
+    object: str = Field(description="Id of the object")
     T: Annotated[Array, Numbers(4, 4, rigid=True)] | None = Field(
-        None, description="Rigid transform (4, 4) of the world [m] that moved it; null = it was taken away"
+        None,
+        description="The object's motion: rigid transform (4, 4), world frame [m]; null = removed",
     )
 
 
@@ -169,42 +171,42 @@ class Gaze(Document):
 
 
 class Waypoint(Document):
-    """Posture of the robot on its way."""
+    """Posture of the robot on its path."""
 
     platform: list[float] = Field(description="x, y, yaw [m, m, rad]")
-    camera_height: float = Field(description="Over the floor [m]")
+    camera_height: float = Field(description="Above the floor [m]")
     gaze: Gaze = Field(description="Direction of the head")
     joints: list[float] | None = Field(description="Joint positions of an arm, or null if unknown")
 
 
 class NextAnswer(Document):
-    """Where to look next."""
+    """The next best view."""
 
     view: int = Field(description="Number of the next view, from 0")
-    T_world_camera: list[list[float]] = Field(description="Pose [m], OpenCV camera frame, world z up")
+    T_world_camera: list[list[float]] = Field(description="Camera pose [m]: OpenCV camera frame, world z up")
     candidate: int = Field(description="Index among the candidates")
     platform: list[float] | None = Field(description="x, y, yaw [m, m, rad]; null with candidates")
-    camera_height: float | None = Field(description="Over the floor [m]; null with candidates")
+    camera_height: float | None = Field(description="Above the floor [m]; null with candidates")
     gaze: Gaze | None = Field(description="Direction of the head; null with candidates")
     joints: list[float] | None = Field(description="Joint positions of an arm, or null if unknown")
     waypoints: list[Waypoint] = Field(
-        description="Postures on the way there, with straight lines in between; empty with candidates"
+        description="Postures on the path there, connected by straight lines; empty with candidates"
     )
     expected_gain: float = Field(description="Saliency s of eq. 3")
     cost: float = Field(description="Cost h of the path, eq. 3")
     score: float = Field(description="c = s − h, eq. 3")
-    why: str = Field(description="One sentence for a person to read")
-    stop: str | None = Field(description="Why another view may not pay, or null")
+    why: str = Field(description="Reason in one sentence")
+    stop: str | None = Field(description="Why another view may not be worth its path, or null")
 
 
 class SessionPool:
-    """The sessions in one folder. Call only `do` from threads other than the pool's own.
+    """The sessions in one folder. From other threads, call only `do`.
 
     Args:
         folder: Folder of the sessions; each has a subfolder of its name.
         config: Settings of new sessions.
-        open_sessions: Maximum number kept open; the least recently used one is closed first.
-        waiting: Maximum number of requests, waiting or in work.
+        open_sessions: Maximum number of open sessions; the least recently used one is closed first.
+        waiting: Maximum number of requests that wait or are being processed.
     """
 
     def __init__(self, folder: Path, config: Config, open_sessions: int, waiting: int) -> None:
@@ -230,7 +232,7 @@ class SessionPool:
             FullError: Too many requests are waiting.
         """
         if self._waiting >= self._max_waiting:
-            raise FullError(f"{self._waiting} requests are already waiting; try again")
+            raise FullError(f"{self._waiting} requests are already waiting; try again later")
         self._waiting += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._worker, work)
@@ -242,34 +244,34 @@ class SessionPool:
         return sorted(path.parent.name for path in self.folder.glob("*/session.json"))
 
     def begin(self, name: str, config: Config, **options: Any) -> Session:
-        """Begin a session; the options are those of `Session.begin`.
+        """Create a session; the options are those of `Session.begin`.
 
         Raises:
-            InputError: The name is taken, or a setting exceeds what a client may ask for.
+            InputError: The name is taken, or a setting exceeds the limits for clients.
             FullError: There are too many sessions, or the disk is full.
         """
         _check_limits(self.config, config)
         self._check_room()
         if len(self.names()) >= self.config.session.max_sessions:
             most = self.config.session.max_sessions
-            raise FullError(f"this service has {most} sessions, its limit session.max_sessions")
+            raise FullError(f"this service has reached session.max_sessions = {most}")
         return self._opened(name, Session.begin(self.folder / name, config, **options))
 
     def session(self, name: str) -> Session:
         """Return a session, opened from disk if needed.
 
         Raises:
-            MissingError: There is no session of this name.
+            MissingError: No session has this name.
             SessionBusyError: Another process has it open.
         """
         if name in self._open:
             return self._opened(name, self._open.pop(name))
         if not (self.folder / name / "session.json").is_file():
-            raise MissingError(f"there is no session '{name}'; begin it first")
+            raise MissingError(f"unknown session '{name}'; create it first")
         return self._opened(name, Session.open(self.folder / name))
 
     def add(self, name: str, view: Capture, number: int | None) -> Added:
-        """Add a view to a session; as `Session.add`.
+        """Add a view to a session, as `Session.add` does.
 
         Raises:
             FullError: The disk is full.
@@ -280,7 +282,7 @@ class SessionPool:
     def _check_room(self) -> None:
         free, least = shutil.disk_usage(self.folder).free, self.config.session.min_free
         if free < least:
-            reason = f"the disk has {free / 1e9:.1f} GB left"
+            reason = f"only {free / 1e9:.1f} GB of disk space is free"
             raise FullError(f"{reason}; session.min_free is {least / 1e9:.1f} GB")
 
     def _opened(self, name: str, session: Session) -> Session:
@@ -296,11 +298,11 @@ class SessionPool:
 
 PROBLEMS: dict[int | str, dict[str, Any]] = {
     **{status: {"model": Problem} for status in (400, 401, 404, 409, 422, 503)},
-    413: {"content": {"text/plain": {}}, "description": "Larger than a request may be"},
+    413: {"content": {"text/plain": {}}, "description": "The request is too large"},
 }
 """Answers to requests that fail, by their status."""
 
-BEARER = HTTPBearer(auto_error=False, description="The token the service was started with")
+BEARER = HTTPBearer(auto_error=False, description="Token with which the service was started")
 """How requests send their token."""
 
 
@@ -309,16 +311,16 @@ def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: st
 
     Args:
         pool: The sessions; started and stopped with the application.
-        token: Token that requests must send; None = only this machine may connect.
+        token: Token that requests must send; None allows only this machine to connect.
         max_request: Maximum size of a request [bytes].
         host: Address it listens on.
     """
     app = FastAPI(
         title="caryatid",
-        summary="Sessions of active vision: views in, support graph and next view out",
+        summary="Active vision sessions: add views, get the support graph and the next best view",
         version=version("caryatid"),
         lifespan=lambda app: pool,
-        docs_url=None,  # these pages load scripts from elsewhere; /openapi.json says the same
+        docs_url=None,  # these pages load external scripts; /openapi.json has the same content
         redoc_url=None,
         max_body_size=max_request,
         responses=PROBLEMS,
@@ -326,7 +328,7 @@ def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: st
     )
     app.add_middleware(Gate, token=token)
     if token is None:
-        # Refuse requests of foreign pages in a browser on this machine: they name another host.
+        # Reject requests from foreign pages in a browser on this machine: they name another host.
         local = ["127.0.0.1", "localhost", "[::1]", host]
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=local)
     for kind in (CaryatidError, RequestValidationError, OSError, MemoryError):
@@ -359,7 +361,7 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @app.post("/sessions", status_code=201, response_model=SessionAnswer)
     @queued
     def begin_session(given: NewSession) -> Any:
-        """Begin a session."""
+        """Create a session."""
         config = changed_settings(pool.config, given.settings, "settings")
         options = given.model_dump(include={"segmentation", "seed", "planner"})
         if given.ignore is not None:
@@ -369,19 +371,19 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @app.get("/sessions/{name}", response_model=SessionAnswer)
     @queued
     def describe_session(name: SessionName) -> Any:
-        """Describe a session, with its number of views."""
+        """Return the options of a session and its number of views."""
         return described(name, pool.session(name))
 
     @app.post("/sessions/{name}/views", status_code=201, response_model=ViewAnswer)
     @queued
     def add_view(name: SessionName, given: NewView) -> Any:
-        """Add a view; when this answers, the view is on disk."""
+        """Add a view; once this returns, the view is safe on disk."""
         return pool.add(name, given.capture(), given.number).to_json()
 
     @app.post("/sessions/{name}/reports", status_code=201, response_model=Known)
     @queued
     def report_change(name: SessionName, given: NewReport) -> Any:
-        """Report an object that was taken away or moved; when this answers, the report is on disk."""
+        """Report an object that was removed or moved; once this returns, the report is safe on disk."""
         session = pool.session(name)
         graph = session.take(given.object, given.T)
         return {"views": session.views, "graph": graph_to_json(graph)}
@@ -389,31 +391,31 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @app.delete("/sessions/{name}/views/last", response_model=Known)
     @queued
     def undo_view(name: SessionName) -> Any:
-        """Remove the last view, or the report after it."""
+        """Undo the last view, or the last report after it."""
         session = pool.session(name)
         return {"views": session.undo(), "graph": graph_to_json(session.graph)}
 
     @app.get("/sessions/{name}/graph")
     @queued
     def get_graph(name: SessionName) -> dict[str, Any]:
-        """Return the support graph, graph.json."""
+        """Return the support graph in the format of graph.json."""
         return graph_to_json(pool.session(name).graph)
 
     @app.get("/sessions/{name}/next", response_model=NextAnswer)
     @queued
     def get_next_view(name: SessionName) -> Any:
-        """Choose the next view for the session's robot."""
+        """Plan the next best view for the session's robot."""
         return pool.session(name).next().to_json()
 
     @app.post("/sessions/{name}/next", response_model=NextAnswer)
     @queued
     def choose_next_view(name: SessionName, given: Reachable) -> Any:
-        """Choose the next view among those that your robot reaches."""
+        """Plan the next best view among poses that your robot can reach."""
         return pool.session(name).next(given.T_world_camera, given.path_length).to_json()
 
 
 class Gate:
-    """Checks the token before a request is read, and limits the time for its body to arrive.
+    """Checks the token before a request is read, and limits the time to receive its body.
 
     Args:
         app: The application behind it.
@@ -441,13 +443,13 @@ class Gate:
                 async with asyncio.timeout_at(deadline):
                     return await receive()
             except TimeoutError:
-                raise HTTPException(408, f"the body did not arrive within {PATIENCE:g} s") from None
+                raise HTTPException(408, f"the request body took longer than {PATIENCE:g} s") from None
 
         await self._app(scope, timely, send)
 
 
 class PatientProtocol(H11Protocol):
-    """HTTP whose keep-alive time also limits the headers of a request, so that incomplete requests end."""
+    """HTTP whose keep-alive timeout also applies to request headers, so that incomplete requests end."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start the timer of the first request."""
@@ -462,7 +464,7 @@ class PatientProtocol(H11Protocol):
 
 
 def _check_limits(own: Config, asked: Config) -> None:
-    """Refuse a client's settings that lift the limits of the service or are far from its own.
+    """Reject settings of a client that change a limit of the service or are far from its settings.
 
     Raises:
         InputError: A limit of the service is changed, or another setting by more than a factor of ten.
@@ -472,7 +474,7 @@ def _check_limits(own: Config, asked: Config) -> None:
             before = getattr(getattr(own, stage), name)
             if value == before:
                 continue
-            remedy = "only those who run the service can change it"
+            remedy = "change it in the settings of the service"
             if stage == "session" or name in ("max_voxels", "max_pixels"):
                 raise InputError(f"{stage}.{name}", "is a limit of the service", remedy)
             given, ours = np.ravel(value), np.ravel(before)
@@ -486,7 +488,7 @@ def _check_limits(own: Config, asked: Config) -> None:
 
 
 async def _refuse(folder: Path, request: Request, error: Exception) -> Response:
-    """Answer with the error in one sentence, without the data sent or the path of the sessions."""
+    """Answer with the error in one sentence, without the data or the path of the sessions."""
     status = next((code for kind, code in STATUS.items() if isinstance(error, kind)), 422)
     text = in_one_line(error)
     if isinstance(error, RequestValidationError):
@@ -502,36 +504,36 @@ def check_token(host: str, token: str | None) -> None:
     """Refuse to serve other machines without a token.
 
     Raises:
-        InputError: There is none, or it is too short to be safe.
+        InputError: The token is missing or too short to be safe.
     """
     if token is not None and len(token) < 16:
-        raise InputError("--token", "has fewer than 16 characters", "give a longer one that is hard to guess")
+        raise InputError("--token", "has fewer than 16 characters", "give a longer random token")
     try:
         local = ipaddress.ip_address(host).is_loopback
     except ValueError:
         local = host == "localhost"
     if token is None and not local:
-        reason = f"{host} can be reached from other machines, and there is no token"
+        reason = f"{host} is open to other machines, and no token is set"
         raise InputError("--host", reason, "set CARYATID_TOKEN, or serve on 127.0.0.1")
 
 
 def run_service(app: FastAPI, host: str, port: int, listening: Callable[[str], None]) -> None:
-    """Serve until Ctrl-C or SIGTERM, then answer all earlier requests.
+    """Serve until Ctrl-C or SIGTERM, then answer the remaining requests.
 
     Args:
         app: The application.
         host: Address to listen on.
-        port: Port; 0 = any free one.
+        port: Port to listen on; 0 = any free port.
         listening: Called with the address of the service.
 
     Raises:
-        InputError: The address is taken.
+        InputError: The address cannot be used.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         listener = socket.create_server((host, port), family=family)
     except (OSError, OverflowError) as error:
-        reason = f"cannot listen there ({(getattr(error, 'strerror', None) or str(error)).lower()})"
+        reason = f"cannot listen on it ({(getattr(error, 'strerror', None) or str(error)).lower()})"
         raise InputError(f"{host}:{port}", reason, "choose another --port or --host") from None
     # With the maximum size of a request, the number of connections limits the memory in use.
     limits: dict[str, Any] = {"http": PatientProtocol, "limit_concurrency": 64}

@@ -37,13 +37,13 @@ CLOUD_SUFFIXES = (".pcd", ".ply")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Source:
-    """Something to explore.
+    """A scene or recording to explore.
 
     Attributes:
         name: Short name.
-        camera: Takes its views.
-        robot: Stands at the first view.
-        truth: The ground truth, if known.
+        camera: Camera that takes the views.
+        robot: Robot, placed at the first view.
+        truth: Ground truth, or None if unknown.
     """
 
     name: str
@@ -81,29 +81,29 @@ def open_source(
         source: Name, file or folder.
         config: All settings.
         noise: Noise of the simulated camera.
-        segmentation: Which segmentation to use.
+        segmentation: `labels`, `auto`, or None to use labels if available.
         seed: Seed of the noise.
         robot: Name of the simulated robot.
         masks: Source of masks, or None to use those of the views.
         ignore: Mask of pixels to ignore in a recording, as for `without_ignored`, or None.
-        level: Turn the world of a recording so that the table is level, for poses whose z is not up.
+        level: Rotate the world frame of a recording so that the table is level.
 
     Raises:
-        InputError: It is none of them, is broken, or lacks required labels; or there is no such robot, a
+        InputError: The source is unknown, broken, or lacks required labels; or the robot is unknown, a
             robot is given for a recording, or an ignore mask for a simulation.
-        PlanningError: The robot reaches no view of the table.
+        PlanningError: The robot cannot reach a view of the table.
     """
     if is_cloud(source):
-        raise InputError(source, "is a single cloud, and there is nowhere to go", "use `caryatid extract`")
+        raise InputError(source, "a single cloud cannot be explored", "use `caryatid extract`")
     if is_recording(source):
         if robot != HUMANOID:
-            reason = "is a recording, its camera can only be where a recorded view is"
-            raise InputError(source, reason, "leave --robot out")
+            reason = "a recording has no robot, because its camera poses are fixed"
+            raise InputError(source, reason, "omit --robot")
         recording = open_recording(source, config, segmentation, masks, ignore, level)
         poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
         return Source(recording.path.name, RecordingCamera(recording), RecordingRobot(poses), None)
     if ignore is not None:
-        raise InputError(source, "is simulated, with nothing of the robot in the image", "leave --ignore out")
+        raise InputError(source, "simulated images do not show the robot", "omit --ignore")
     return simulate(source, noise=noise, robot=robot, seed=seed, config=config)
 
 
@@ -128,8 +128,8 @@ def simulate(
         The camera, the robot at its first view, and the ground truth.
 
     Raises:
-        InputError: There is no such scene, noise model or robot.
-        PlanningError: The robot reaches no view of the table.
+        InputError: The scene, noise model or robot is unknown.
+        PlanningError: The robot cannot reach a view of the table.
     """
     check_type("scene", scene, (str, Path), "give the name of a built-in scene, or an MJCF file")
     check_type("config", config, (Config, NoneType), "give a caryatid.Config")
@@ -149,14 +149,14 @@ def open_recording(
     ignore: Path | None = None,
     level: bool = False,
 ) -> Dataset:
-    """Open a dataset and decode every frame once, so that a broken one is reported before any work is done.
+    """Open a dataset and decode every frame once, to report a broken frame before any other work.
 
-    From a video, a few sharp frames are chosen. A mask source replaces the masks of the dataset. Ignored
-    pixels are left out. With `level`, the world is turned so that the table is level.
+    A few sharp frames are chosen from a video. A mask source replaces the masks of the dataset. Ignored
+    pixels are dropped. With `level`, the world frame is rotated so that the table is level.
 
     Raises:
-        InputError: It or the mask is broken, required labels are missing, a segment is too small for a
-            shape, or no table shows what is level.
+        InputError: The dataset or the mask is broken, required labels are missing, a segment is too small
+            for a shape, or no table is visible to level the world frame.
     """
     recording = open_dataset(folder, config.recording)
     if recording.is_video:
@@ -194,20 +194,20 @@ def extract(
     ignore: Path | None = None,
     level: bool = False,
 ) -> Iterator[Step]:
-    """Open a recording or a cloud; returns the steps of all its views.
+    """Open a recording or a cloud, and return the steps of all its views.
 
     Args:
         source: Name, file or folder.
         config: All settings.
-        segmentation: Which segmentation to use.
+        segmentation: `labels`, `auto`, or None to use labels if available.
         seed: Seed of every random choice.
-        label_divisor: For a cloud whose labels number parts of objects: object = label // this.
+        label_divisor: For a cloud with labels of object parts: object = label // this.
         masks: Source of masks, or None to use those of the views.
         ignore: Mask of pixels to ignore in a recording, as for `without_ignored`, or None.
-        level: Turn the world of a recording so that the table is level, for poses whose z is not up.
+        level: Rotate the world frame of a recording so that the table is level.
 
     Raises:
-        InputError: It is neither, is broken, or lacks required labels; or masks are given for a cloud.
+        InputError: The source is unknown, broken, or lacks required labels; or masks are given for a cloud.
         PerceptionError: A cloud shows no support surface.
     """
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
@@ -215,8 +215,8 @@ def extract(
         recording = open_recording(source, config, segmentation, masks, ignore, level)
         return _look_at_all(explorer, recording)
     if masks is not None or ignore is not None:
-        remedy = "leave --masks and --ignore out; labels of a cloud are its field label"
-        raise InputError(source, "is a cloud, which has no image for masks", remedy)
+        remedy = "omit --masks and --ignore; a cloud has its labels in the field label"
+        raise InputError(source, "masks need images, and a cloud has none", remedy)
     stored, use_labels = read_stored_cloud(source, label_divisor), segmentation != "auto"
     if segmentation == "labels" and stored.labels is None:
         raise InputError(source, "has no field label", "use --segmentation auto")
@@ -250,9 +250,9 @@ def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:
 
 
 def _check_segments(source: str, points: Mapping[int, int], config: Config) -> None:
-    """Refuse a segment with fewer points than a shape needs; 0 is not an object."""
+    """Reject a segment with fewer points than a shape needs; 0 is not an object."""
     least = config.fit.min_points
     small = sorted(label for label, count in points.items() if label != 0 and count < least)
     if small:
-        reason = f"segment {small[0]} has {points[small[0]]} points with depth, a shape needs {least}"
-        raise InputError(source, reason, "take it out, show more of it, or use --segmentation auto")
+        reason = f"segment {small[0]} has {points[small[0]]} points with depth, but a shape needs {least}"
+        raise InputError(source, reason, "remove or enlarge its mask, or use --segmentation auto")

@@ -79,8 +79,8 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
         tree = _read_transforms(bag, config.pose_gap)
         for frame in dict.fromkeys([options.world, *(depth.frame for depth in depths)]):
             if frame not in tree.frames:
-                known = f"there are {', '.join(tree.frames)}"
-                raise InputError(path, f"there is no frame '{frame}' in its transforms", known)
+                known = f"known frames: {', '.join(tree.frames)}"
+                raise InputError(path, f"unknown frame '{frame}'", known)
         pose_at = partial(tree.between, options.world)
     if distorts:
         notes.append("the lens distorts, but a pinhole camera is assumed: give rectified topics")

@@ -94,7 +94,7 @@ def plan_order(
     """
     rehearsal = _Rehearsal(graph, config or Config(), seed, threads)
     if goal is not None and goal not in rehearsal.ids:
-        raise InputError(goal, "is not an object of the graph", f"there are {', '.join(rehearsal.ids)}")
+        raise InputError(goal, "is not an object of the graph", f"known objects: {', '.join(rehearsal.ids)}")
     found: list[TakeStep] = []
     refusal = ""
     while len(found) != steps and (left := rehearsal.left()) and (goal is None or goal in left):

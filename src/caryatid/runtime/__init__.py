@@ -10,7 +10,7 @@ from typing import Any
 
 
 def imported_late(package: str, homes: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
-    """Make the `__getattr__` (PEP 562) of a package whose names are imported when first used.
+    """Make the `__getattr__` (PEP 562) of a package that imports its names on first use.
 
     Args:
         package: Its `__name__`.
@@ -27,15 +27,15 @@ def imported_late(package: str, homes: Mapping[str, Sequence[str]]) -> Callable[
 
 
 LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely")
-"""Libraries whose version may change a result."""
+"""Libraries whose version can change a result."""
 
 BYSTANDERS = frozenset(
     {"benchmark", "cli", "exports.py", "service.py", "sessions", "sources.py", "viewer", "viz"}
 )
-"""Parts of caryatid that only pass on or show results, except for the modules in `DECIDING`."""
+"""Parts of caryatid that do not affect results, except for the modules in `DECIDING`."""
 
 DECIDING = frozenset({"benchmark/episodes.py"})
-"""Modules in these parts that affect results."""
+"""Modules in these parts that do affect results."""
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Kernels are compiled once after installation, by a few processes in parallel, before the first view.
+"""Compile all kernels once after installation, in a few parallel processes, before the first view.
 
 numba compiles a kernel at its first call and caches it on disk, so no list of kernels is needed: the
 processes *warm up*. Each calls everything that uses kernels, on small scenes (`caryatid.simulation.warm_up`),
@@ -33,7 +33,7 @@ from caryatid.runtime.display import call
 from caryatid.runtime.parallel import cores
 
 log = logging.getLogger(__name__)
-"""Says that kernels are compiled, and why they cannot be."""
+"""Reports that kernels are being compiled, and why they cannot be."""
 
 ROOT = Path(__file__).parents[1]
 MARK = "CARYATID_COMPILES"
@@ -55,7 +55,7 @@ def compile_kernels() -> None:
     Several processes may call this at once: one compiles, the others wait.
 
     Raises:
-        InputError: There is no writable folder for compiled kernels.
+        InputError: No folder for compiled kernels is writable.
     """
     if numba.config.DISABLE_JIT or MARK in os.environ or not sys.executable or hasattr(sys, "frozen"):
         return
@@ -70,7 +70,7 @@ def compile_kernels() -> None:
         done = _read(stamp)
         if done == wanted:
             return
-        log.info("compiling kernels, once after installation: about 20 seconds")
+        log.info("compiling kernels (once after installation, about 20 seconds)")
         for module in wanted.keys() - {name for name, digest in done.items() if wanted.get(name) == digest}:
             # numba does not notice a change of a kernel in another module that this one calls.
             source = ROOT / f"{module.replace('.', '/')}.py"
@@ -105,7 +105,7 @@ def cache_of(folder: Path) -> Path:
     try:
         return Path(njit(cache=True)(names["nothing"]).stats.cache_path)
     except RuntimeError:
-        reason = "compiled kernels cannot be cached: no folder for them is writable"
+        reason = "no writable folder for compiled kernels"
         raise InputError("NUMBA_CACHE_DIR", reason, "set it to a writable folder") from None
 
 

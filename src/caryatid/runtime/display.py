@@ -1,4 +1,4 @@
-"""Hooks for functions of higher rooms, which the package registers, so that no room imports one above it."""
+"""Hooks that let lower-level packages call higher-level ones without importing them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from pkgutil import resolve_name
 from typing import Any
 
 hooks: dict[str, str] = {}
-"""Name of a hook → `module:function`, imported at the first call; `caryatid/__init__.py` fills it."""
+"""Name of a hook → `module:function`, imported at the first call; registered in `caryatid/__init__.py`."""
 
 
 def call(hook: str, *arguments: Any) -> Any:
-    """Call the function that a hook names, and return what it returns.
+    """Call the function registered for a hook, and return its result.
 
     Args:
         hook: One of the names in `hooks`.
@@ -20,7 +20,7 @@ def call(hook: str, *arguments: Any) -> Any:
 
 
 class Pictured:
-    """Gives a class its picture in a notebook."""
+    """Mixin that shows an object as a picture in a notebook."""
 
     __slots__ = ()
 

@@ -1,8 +1,8 @@
-"""Work on several cores: Python threads call compiled kernels that release the GIL.
+"""Parallel work: Python threads call compiled kernels that release the GIL.
 
-numba's own parallel loop compiles everything it calls once more, which can take many seconds. Here each
-kernel is compiled once, and the loop is not compiled. BLAS gets one thread, because our matrices are small
-and waiting threads cost more than they save.
+numba's parallel loop recompiles everything it calls, which can take many seconds. Here each kernel is
+compiled once, and the loop is not compiled. BLAS gets one thread, because the matrices are small and waiting
+threads cost more than they save.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from caryatid.io.json_files import Numbers, parse_json, read_json
 from caryatid.io.staging import read_errors
 from caryatid.sensing.views import View
 
-REMEDY: Final = "remove this view and all later ones from the session's folder"
+REMEDY: Final = "delete this view and all later ones from the session folder"
 """Remedy for a damaged view."""
 
 _FILES: Final = {
@@ -39,11 +39,11 @@ class CameraRecord:
 
     Attributes:
         K: Pinhole matrix (3, 3) [px].
-        T_world_camera: Camera pose (4, 4) [m]; OpenCV camera frame, world z up. The first view may lack one;
-            its table then defines the world.
-        depth_scale: Millimetres of one unit of a depth PNG.
+        T_world_camera: Camera pose (4, 4) [m]; OpenCV camera frame, world z up. The first view may omit it;
+            its table then defines the world frame.
+        depth_scale: Millimetres per unit of a depth PNG.
         name: Name of the view in messages.
-        labels_are: Whether a label means an object in all views or a segment of this view.
+        labels_are: Whether a label identifies an object in all views or a segment of this view.
         digest: Digest of camera and images; empty until the view is stored.
     """
 
@@ -69,9 +69,9 @@ class Capture:
     """One view, not decoded yet.
 
     Attributes:
-        images: Files: `depth` and, where given, `rgb` and `labels`; PNG (rgb also JPEG), or .npy: depth
-            (H, W) floats [m], rgb (H, W, 3) uint8, labels (H, W) whole numbers.
-        camera: The camera that took them; its digest does not count.
+        images: Files: `depth` and, if given, `rgb` and `labels`; PNG (rgb also JPEG), or .npy: depth
+            (H, W) floats [m], rgb (H, W, 3) uint8, labels (H, W) integers.
+        camera: Camera matrix and pose; its digest is ignored.
     """
 
     images: Mapping[str, bytes]
@@ -92,14 +92,14 @@ class Capture:
         Args:
             files: Images: `depth`, and optionally `rgb` and `labels`.
             camera: JSON with K, T_world_camera and, for a depth PNG, depth_scale.
-            config: How large images may be.
+            config: Limits on the size of images.
 
         Raises:
-            InputError: One is missing or too large, or the camera is not valid.
+            InputError: A file is missing or too large, or the camera is not valid.
         """
         images = {key: _read(path, config.max_bytes) for key, path in files.items() if path is not None}
         given = CameraRecord.read(
-            camera, "give K (3×3), and T_world_camera (4×4, in metres) for all views after the first"
+            camera, "give K (3×3) and, for all views after the first, T_world_camera (4×4, in metres)"
         )
         return cls(images, replace(given, name=str(files["depth"])))
 
@@ -136,11 +136,11 @@ class Capture:
         return files | {"camera.json": f"{document}\n".encode()}
 
     def decode(self, max_pixels: int) -> View:
-        """Decode the images, each of up to a maximum number of pixels.
+        """Decode the images, each with at most this number of pixels.
 
         Raises:
-            InputError: One is broken, too large, of the wrong kind, or sizes differ; the camera is not a
-                pinhole camera, or its pose is not a rigid transform.
+            InputError: An image is broken, too large, or of the wrong kind; sizes differ; the camera is not
+                a pinhole camera, or its pose is not a rigid transform.
         """
         camera = self.camera
         decoded = {
@@ -159,9 +159,10 @@ def _decoded(key: str, content: bytes, name: str, max_pixels: int) -> NDArray[An
         return decode_image(content, name, *_FILES[key], max_pixels)
     array = read_npy(content, name)
     if array.ndim < 2 or (key == "depth" and array.dtype.kind != "f"):
-        raise InputError(name, f"is {array.shape} of {array.dtype}", "give (H, W), depth as floats in metres")
+        reason = f"wrong shape {array.shape} or type {array.dtype}"
+        raise InputError(name, reason, "give an array (H, W), for depth of floats in metres")
     if array.shape[0] * array.shape[1] > max_pixels:
-        reason = f"has shape {array.shape}, {max_pixels} pixels are allowed"
+        reason = f"shape {array.shape} exceeds {max_pixels} pixels"
         raise InputError(name, reason, "give a smaller image, or raise recording.max_pixels")
     return np.ascontiguousarray(array)
 
@@ -173,7 +174,7 @@ def _suffix(content: bytes) -> str:
 
 
 def _read(path: Path, max_bytes: float = np.inf) -> bytes:
-    with read_errors(path, "give a file you may read"):
+    with read_errors(path, "give a readable file"):
         if path.stat().st_size > max_bytes:
             raise InputError(path, f"is larger than {max_bytes} bytes", "give a smaller file")
         return path.read_bytes()

@@ -1,4 +1,4 @@
-"""The next view, and the robot's posture there."""
+"""The next best view, and the robot's posture there."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from caryatid.sensing.view_sphere import ViewSphere
 
 @dataclass(frozen=True, eq=False, slots=True)
 class NextView:
-    """Where to look next.
+    """The next best view.
 
     Attributes:
         number: Number of the next view, from 0.
         decision: Pose, waypoints (none with given candidates), expected gain, cost and reason.
-        stop: Why another view may not pay, or None.
+        stop: Why another view may not be worth its path, or None.
     """
 
     number: int
@@ -56,7 +56,7 @@ class NextView:
 
 @dataclass(frozen=True, eq=False)
 class Reachable:
-    """Views that a robot can reach: candidates.json.
+    """Candidate views that a robot can reach: candidates.json.
 
     Attributes:
         T_world_camera: Camera poses (N, 4, 4) [m]; OpenCV camera frame, world z up.
@@ -68,13 +68,13 @@ class Reachable:
 
 
 def table_floor(scene: Scene) -> FloorGrid:
-    """The floor around the table; the area under its top and under the objects on it is blocked.
+    """The floor around the table; the area under the table top is blocked.
 
     Raises:
-        PlanningError: No view is known yet.
+        PlanningError: The scene has no views.
     """
     if scene.surface is None or scene.sphere is None:
-        raise PlanningError("nothing has been seen yet; add a first view")
+        raise PlanningError("the session has no views; add a first view")
     shape = scene.surface.shape
     top = float(scene.surface.point_world[2])
     T_world_box = transforms.rigid(shape.T_world_object[:3, :3], (*shape.T_world_object[:2, 3], top / 2.0))
@@ -84,9 +84,9 @@ def table_floor(scene: Scene) -> FloorGrid:
 
 
 def reached_candidates(robot: Robot, T_world_camera: Array, sphere: ViewSphere) -> Candidates:
-    """The views that a robot reaches from its camera pose (4, 4), with or without its roll.
+    """Views that a robot can reach from its camera pose (4, 4), with or without its roll.
 
-    If it cannot hold that pose, paths are straight lines.
+    If the robot cannot hold that pose, paths are straight lines.
     """
     for T in (T_world_camera, transforms.look_at(T_world_camera[:3, 3], sphere.centre_world)):
         if isinstance(robot.solve(T), Posture):

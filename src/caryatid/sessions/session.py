@@ -2,11 +2,11 @@
 
     DIR/session.json           settings, seed, planner and robot
     DIR/views/NNNNNN/          one view: its images, and camera.json; the record
-    DIR/reports/NNNNNN.json    an object that the robot took away or moved, after so many views
+    DIR/reports/NNNNNN.json    an object that the robot removed or moved
     DIR/state/NNNNNN.pickle    the scene after so many views and reports; a cache, which may be deleted
     DIR/lock                   locked by the process that writes
 
-A rename adds a view's folder, complete and on disk, and a rename removes it; the same goes for a report.
+Views and reports are written completely, then renamed into place; removal also starts with a rename.
 """
 
 from __future__ import annotations
@@ -69,15 +69,15 @@ KNOWN: Final = {
     ("numpy._core.multiarray", "scalar"),
     ("numpy._core.numeric", "_frombuffer"),
 }
-"""What a snapshot may contain besides classes of caryatid, so that a session from elsewhere runs no code."""
+"""Types that a snapshot may contain besides classes of caryatid; a foreign session cannot run code."""
 
 
 class SessionConflictError(InputError):
-    """The session is not in the state the request expects: its folder is taken, or it has other views."""
+    """The session is not in the state that the request expects: its folder is taken, or views differ."""
 
 
 class SessionBusyError(SessionConflictError):
-    """Another process writes to the session."""
+    """Another process is writing to the session."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,18 +110,18 @@ class Beginning:
         """Read session.json.
 
         Raises:
-            InputError: It is missing, of another format, or its settings are not those of this release.
+            InputError: It is missing, of another format, or has settings unknown to this release.
         """
         if not path.is_file():
-            raise InputError(path.parent, "holds no session", "begin one with `caryatid session new`")
+            raise InputError(path.parent, "not a session", "create one with `caryatid session new`")
         document = read_json(path)
         release = document.get("caryatid", "0.1.0")  # the first release did not say which it was
         try:
             if not FORMAT.items() <= document.items():
-                raise InputError(path, f"is not in format {FORMAT}")
+                raise InputError(path, f"wrong format, expected {FORMAT}")
             return parse_json(cls, document, path)
         except InputError as error:
-            reason = f"was begun with caryatid {release} and does not fit this release ({error.reason})"
+            reason = f"created by caryatid {release}, incompatible with this release ({error.reason})"
             remedy = "open it with that release, or add its views to a new session"
             raise InputError(path, reason, remedy) from None
 
@@ -135,7 +135,7 @@ class Added:
         graph: The fused support graph with it.
         changed: Whether it changed the graph.
         T_world_camera: Registered camera pose (4, 4), or None while the view waits.
-        note: That the view waits for one that shows the table top, or None.
+        note: Why the view waits for one that shows the table top, or None.
     """
 
     number: int
@@ -153,10 +153,10 @@ class Added:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Moved:
-    """moved.json: how an object was moved.
+    """moved.json: the motion of an object.
 
     Attributes:
-        T: Rigid transform (4, 4) of the world [m].
+        T: Rigid transform (4, 4) in the world frame [m].
     """
 
     T: Annotated[Array, Numbers(4, 4, rigid=True)]
@@ -164,12 +164,12 @@ class Moved:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Report:
-    """What the robot reports it did to an object.
+    """Report of an object that the robot removed or moved.
 
     Attributes:
-        object: Its id.
-        after: Number of views before it.
-        T: Rigid transform (4, 4) of the world that moved it, or None where it was taken away.
+        object: Id of the object.
+        after: Number of views before the report.
+        T: The object's motion as a rigid transform (4, 4) in the world frame, or None if it was removed.
     """
 
     object: str
@@ -181,10 +181,10 @@ class Report:
         return (json.dumps(asdict(self), default=np.ndarray.tolist) + "\n").encode()
 
     def apply(self, scene: Scene) -> None:
-        """Update a scene with it.
+        """Apply the report to a scene.
 
         Raises:
-            InputError: It has no such object.
+            InputError: The scene does not have the object.
         """
         if self.T is None:
             scene.removed(self.object)
@@ -197,14 +197,14 @@ Event = CameraRecord | Report
 
 
 class Session:
-    """A scene model in a folder; `begin` or `open` one.
+    """A scene model in a folder, created by `begin` or opened by `open`.
 
     A view is on disk before `add` returns, and a report before `take` returns, so no crash or power failure
-    loses it. There is one writer at a time; others may read meanwhile.
+    loses it. Only one process writes at a time; others may read meanwhile.
 
     Attributes:
         path: The folder.
-        beginning: Its options.
+        beginning: Options of the session.
         scene: The scene model; do not update it.
     """
 
@@ -233,7 +233,7 @@ class Session:
         robot: str = HUMANOID,
         ignore: NDArray[np.bool_] | None = None,
     ) -> Session:
-        """Begin a session in a new or empty folder, to write to it.
+        """Create a session in a new or empty folder, and open it for writing.
 
         Args:
             path: The folder.
@@ -244,10 +244,10 @@ class Session:
             planner: Name of the planner that chooses the next view.
             robot: Name of the robot that takes it, as for `find_robot`; the table is the only obstacle on
                 its floor.
-            ignore: Pixels (H, W) that are ignored in every view, such as the robot's own arm, or None.
+            ignore: Pixels (H, W) to ignore in every view, such as those of the robot's arm, or None.
 
         Raises:
-            InputError: The folder is not empty or cannot be written, or there is no such planner or robot.
+            InputError: The folder is not empty or cannot be written, or the planner or robot is unknown.
         """
         make_planner(planner)
         find_robot(robot)
@@ -258,7 +258,7 @@ class Session:
             folder.mkdir(parents=True, exist_ok=True)
             taken = any(p.name not in ("views", "lock") and p.name[0] != "." for p in folder.iterdir())
         path = folder / "session.json"
-        conflict = "already holds a session or other files", "use that session, or give a new folder"
+        conflict = "already contains a session or other files", "use that session, or give a new folder"
         if taken:
             raise SessionConflictError(folder, *conflict)
         with ExitStack() as failure:
@@ -278,12 +278,12 @@ class Session:
         """Open a session with all its views.
 
         Args:
-            path: Its folder.
-            read_only: Leave the folder as it is; another process may be writing to it.
+            path: Folder of the session.
+            read_only: Do not write; another process may be writing to it.
 
         Raises:
-            SessionBusyError: Another writer has it open.
-            InputError: It is not a session, or a view is broken.
+            SessionBusyError: Another process has it open for writing.
+            InputError: The folder is not a session, or a view is broken.
         """
         folder = Path(path)
         beginning = Beginning.read(folder / "session.json")
@@ -301,7 +301,7 @@ class Session:
         self.close()
 
     def close(self) -> None:
-        """Release the lock, so that others may write."""
+        """Release the lock, so that other processes can write."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None
@@ -321,15 +321,15 @@ class Session:
         return self.scene.graph
 
     def add(self, view: View | Capture, number: int | None = None) -> Added:
-        """Add a view; when this returns, it is on disk.
+        """Add a view; once this returns, the view is on disk.
 
         Args:
-            view: A view, or one that is not decoded yet. Only the first one may lack a pose.
-            number: Expected number of the view, from 0; None = the next one. The last view is not added a
-                second time, so a client that missed the answer can send it again.
+            view: A view, decoded or not. Only the first view may lack a pose.
+            number: Number of the view, from 0; None = the next one. The last view is not added twice, so a
+                client that missed the answer can send it again.
 
         Raises:
-            SessionConflictError: It would have another number.
+            SessionConflictError: The view would get another number.
             InputError: The view cannot be used; the session does not change.
             PerceptionError: It has no readings; the session does not change.
         """
@@ -338,13 +338,13 @@ class Session:
         record = capture.record
         if number is not None and number != self.views:
             if number != self.views - 1 or record.digest != self._records[-1].digest:
-                reason = f"was given the number {number}, the next one is {self.views}"
+                reason = f"has number {number}, but the next view is {self.views}"
                 raise SessionConflictError(record.name, reason)
             return self._added()
         decoded = self._decode(capture)
         self._check_alike(decoded)
         scene = self.scene.copy()
-        graph_text(scene.update(decoded))  # a view whose graph cannot be written is refused, and not kept
+        graph_text(scene.update(decoded))  # reject a view whose graph cannot be written
         with StagedFolder(self._folder(self.views), durable=True) as folder:
             for name, content in capture.files().items():
                 folder.write(name, content)
@@ -354,17 +354,17 @@ class Session:
         return self._added()
 
     def take(self, object_id: str, T: ArrayLike | None = None) -> SupportGraph:
-        """Report that the robot took an object away or moved it; when this returns, the report is on disk.
+        """Report that the robot removed or moved an object; once this returns, the report is on disk.
 
         Args:
             object_id: Id of the object.
-            T: Rigid transform (4, 4) of the world that moved it; None = it was taken away.
+            T: The object's motion as a rigid transform (4, 4) in the world frame; None = removed.
 
         Returns:
-            The graph without it, or with it where it is now.
+            The graph without the object, or with it at its new pose.
 
         Raises:
-            InputError: There is no such object, or T is not a rigid transform; the session does not change.
+            InputError: The object is unknown, or T is not a rigid transform; the session does not change.
         """
         self._check_writable()
         report = Report(object_id, self.views, None if T is None else as_rigid(T, "T"))
@@ -385,20 +385,20 @@ class Session:
         self._write_snapshot(scene, self._events)
 
     def next(self, candidates: ArrayLike | None = None, path_length: ArrayLike | None = None) -> NextView:
-        """Choose where to look next.
+        """Plan the next best view.
 
         Args:
-            candidates: Camera poses (N, 4, 4) that can be reached; None = those that the session's robot
-                reaches on a floor with only the table.
+            candidates: Reachable camera poses (N, 4, 4); None = those that the session's robot reaches, with
+                the table as the only obstacle.
             path_length: Path length (N,) [m] to each candidate; None = straight lines.
 
         Raises:
-            PlanningError: There is no view yet, or none can be reached.
-            InputError: Candidates are not poses.
+            PlanningError: The session has no views, or no view is reachable.
+            InputError: The candidates are not poses.
         """
         sphere, robot = self.scene.sphere, None
         if sphere is None:
-            raise PlanningError("nothing has been seen yet; add a view that shows the table top")
+            raise PlanningError("no view shows a table top yet; add one that does")
         poses = [record.T_world_camera for record in self._records]
         T_world_cameras = np.stack([self.scene.T_world_cameras[0] if T is None else T for T in poses])
         if candidates is not None:
@@ -420,17 +420,17 @@ class Session:
         return NextView(self.views, decision, stop)
 
     def undo(self) -> int:
-        """Remove the last view, or the report after it.
+        """Undo the last view, or the last report after it.
 
         Returns:
             Number of views left.
 
         Raises:
-            InputError: There is none, or an earlier one is broken; the session does not change.
+            InputError: The session has no views, or an earlier one is broken; the session does not change.
         """
         self._check_writable()
         if not self._events:
-            raise SessionConflictError(self.path, "has no views to remove", "add one first")
+            raise SessionConflictError(self.path, "has nothing to undo", "add a view first")
         left = self._events[:-1]
         scene = self._after(left)
         if isinstance(self._events[-1], Report):
@@ -442,29 +442,29 @@ class Session:
         return self.views
 
     def _added(self) -> Added:
-        note = KEPT % "no support surface has been seen yet" if self.scene.waiting else None
+        note = KEPT % "no view shows a support surface yet" if self.scene.waiting else None
         pose = None if self.scene.waiting else self.scene.T_world_camera
         return Added(self.views - 1, self.graph, self.scene.changed, pose, note)
 
     def _check_writable(self) -> None:
         if self._lock is None:
-            raise InputError(self.path, "is closed or read-only", "open it again to change it")
+            raise InputError(self.path, "is closed or read-only", "open it for writing")
 
     def _check_alike(self, view: View) -> None:
-        """Refuse a view whose labels or camera do not match those of the first view."""
+        """Reject a view whose labels or camera do not match those of the first view."""
         first, segmentation = self._first, self.beginning.segmentation
         if segmentation == "labels" and view.labels is None:
-            remedy = "give a label image, or a session with --segmentation auto"
+            remedy = "give a label image, or create a session with --segmentation auto"
             raise InputError(view.name, "has no labels", remedy)
         if first is None:
             return
         if segmentation is None and (first.labels is None) != (view.labels is None):
-            reason = f"has {'no ' if view.labels is None else ''}labels, unlike the views so far"
-            raise InputError(view.name, reason, "give them for every view, or for none")
+            reason = f"has {'no ' if view.labels is None else ''}labels, unlike earlier views"
+            raise InputError(view.name, reason, "give labels for every view, or for none")
         same_size = view.depth.shape == first.depth.shape
         if not same_size or not np.allclose(view.K, first.K, atol=1e-3 * float(first.K[0, 0])):
-            reason = f"its camera has {described(view)}, that of the views so far has {described(first)}"
-            raise InputError(view.name, reason, "use the same camera, or a new session")
+            reason = f"its camera has {described(view)}, but that of earlier views has {described(first)}"
+            raise InputError(view.name, reason, "use the same camera, or create a new session")
 
     def _folder(self, number: int) -> Path:
         return self.path / "views" / f"{number:06d}"
@@ -473,16 +473,16 @@ class Session:
         return self.path / "reports" / f"{number:06d}.json"
 
     def _kept(self) -> list[Event]:
-        with read_errors(self.path / "views", "put the folder of the views back"):
+        with read_errors(self.path / "views", "restore this folder"):
             folders = sorted(p for p in (self.path / "views").iterdir() if p.name[0].isdigit())
         files = sorted(p for p in (self.path / "reports").glob("*.json") if p.name[0].isdigit())
         for found, place, what in ((folders, self._folder, "view"), (files, self._report, "report")):
             for number, path in enumerate(found):
                 if path != place(number):
-                    remedy = "put it back, or remove the later ones"
-                    raise InputError(path.parent, f"has no {what} {number:06d}", remedy)
+                    remedy = "restore it, or delete the later ones"
+                    raise InputError(path.parent, f"{what} {number:06d} is missing", remedy)
         records = [CameraRecord.read(folder / "camera.json") for folder in folders]
-        remedy = "remove this report and all later ones from the session's folder"
+        remedy = "delete this report and all later ones from the session folder"
         reports = [parse_json(Report, read_json(path, remedy), path, remedy) for path in files]
         events: list[Event] = []
         # Reports of views that another process has just added are left to the next reader.
@@ -557,8 +557,8 @@ def _locked(path: Path) -> FileLock:
         try:
             lock.acquire()
         except Timeout:
-            remedy = "wait until it has finished, or stop it"
-            raise SessionBusyError(path.parent, "another writer has this session open", remedy) from None
+            remedy = "wait until it finishes, or stop it"
+            raise SessionBusyError(path.parent, "in use by another process", remedy) from None
     return lock
 
 

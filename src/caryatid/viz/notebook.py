@@ -54,7 +54,7 @@ def cell_html(section: Section) -> str:
 def _cell_of(shown: object) -> Section:
     match shown:
         case Scene(views=0):
-            return Section("Scene", "nothing has been seen yet; update(view) takes in a first view.")
+            return Section("Scene", "no views yet; call update(view) with a first view.")
         case Scene(graph=graph, cloud=cloud):
             lead = f"{count_of(shown.views, 'view')}, {len(cloud):,} points, {census(graph)}"
             return _graph_cell("Scene", lead, graph, _cloud(cloud, graph, shown.T_world_camera))
