@@ -144,7 +144,7 @@ def test_what_is_added_comes_back_and_only_what_is_missing_is_asked_for(tmp_path
         assert store.plan("smoke", twice) == [m.episode for m in members]
         store.add(members[0].episode, Outcome((row(1, 0.1 + 0.2),)))
         store.add(members[1].episode, Outcome((), "no luck"))
-        with pytest.raises(InputError, match="another run is writing to it; wait until it ends"):
+        with pytest.raises(InputError, match="in use by another process; wait until it finishes"):
             ResultStore(path, "code")
         with ResultStore(path) as reading:
             assert list(reading.suites) == ["smoke"]
@@ -197,7 +197,7 @@ def test_everything_that_decides_an_episode_is_in_its_key(other):
 
 def test_what_is_no_result_of_this_code_is_refused_and_left_as_it_is(tmp_path):
     path = tmp_path / RESULTS
-    with pytest.raises(InputError, match="no result file; run a suite first"):
+    with pytest.raises(InputError, match="the file is missing; run a suite first"):
         ResultStore(path)
     with ResultStore(path, "code", {"version": "0.1"}):
         pass

@@ -232,7 +232,7 @@ def test_config_writes_settings_that_read_back_as_they_are(tmp_path, capsys):
     text = capsys.readouterr().out
     assert tomllib.loads(text)["fit"]["hypotheses"] == 77
     assert tomllib.loads(text).keys() == asdict(Config()).keys()
-    assert "# An object displaced by more than this was disturbed [m]" in text
+    assert "# Displacement above which an object was disturbed [m]" in text
     (tmp_path / "settings.toml").write_text(text)
     assert run_command("config", "--config", tmp_path / "settings.toml") == 0
     assert capsys.readouterr().out == text

@@ -222,8 +222,8 @@ def test_too_many_objects_are_refused_before_they_are_read(tmp_path, graph, caps
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--out", "model.step"], "does not end as any format does"),
-        (["--format", "mjcf", "--out", "graph.json"], "does not end as mjcf does"),
+        (["--out", "model.step"], "the suffix is not that of any format"),
+        (["--format", "mjcf", "--out", "graph.json"], "the suffix is not that of mjcf"),
         (["--out", "folder.urdf"], "is a folder"),
     ],
 )
@@ -241,9 +241,9 @@ def test_a_file_that_is_no_export_is_never_touched(tmp_path, kept_run, monkeypat
 
 def test_what_cannot_be_exported_is_said(tmp_path, graph, capsys):
     assert run_command("export", tmp_path / "no-run", "--out", tmp_path / "s.xml") == 1
-    assert "is not a folder" in capsys.readouterr().err
+    assert "not a directory" in capsys.readouterr().err
     assert run_command("export", tmp_path, "--format", "step", "--out", tmp_path / "s.step") == 2
-    with pytest.raises(InputError, match="holds no objects"):
+    with pytest.raises(InputError, match="has no objects"):
         export_graph(SupportGraph(), tmp_path / "s.glb")
     named = replace(graph, objects=(replace(graph.objects[1], id="world"),), supports=())
     with pytest.raises(InputError, match="called 'world'"):

@@ -104,7 +104,7 @@ def test_an_interrupted_clearing_says_how_it_goes_on(tmp_path):
     command.wait_for("view 2:")
     status, out, told = command.interrupt()
     assert (status, out) == (130, "")
-    assert f"views are kept in {tmp_path / 'run'}; the same command continues" in told
+    assert f"views are kept in {tmp_path / 'run'}; run the same command to continue" in told
 
 
 def test_what_reads_only_ends_at_once_and_leaves_nothing(tmp_path, scene_file):

@@ -68,7 +68,7 @@ class TestOrder:
         assert plan_order(tower(), CONFIG, seed=3, threads=2) == order
         assert (
             order.steps[-1].why
-            == "it supports nothing that is left; lifting it disturbed nothing in 2 rehearsals"
+            == "it supports no remaining object; lifting it disturbed nothing in 2 rehearsals"
         )
 
     def test_to_get_at_one_object_only_what_is_in_the_way_is_taken(self):
@@ -120,7 +120,9 @@ class TestOrder:
         with pytest.raises(InputError, match="no support surface"):
             plan_order(SupportGraph(tower().objects[1:]), CONFIG)
         crowd = [replace(tower().objects[1], id=f"o{number}") for number in range(1000)]
-        with pytest.raises(InputError, match=r"1000 objects.* 4\.6 GB a thread; raise rehearsal.max_objects"):
+        with pytest.raises(
+            InputError, match=r"1000 objects.* 4\.6 GB per thread; raise rehearsal.max_objects"
+        ):
             plan_order(SupportGraph((table_object(TOP), *crowd)), CONFIG)
 
 
@@ -217,7 +219,7 @@ class TestCommands:
         command = ["clear", scene_file, "--json", "--out", tmp_path / "run"]
         assert run_command(*command, *SMALL, *QUICK) == 0
         document = json.loads(capsys.readouterr().out)
-        assert (document["success"], document["left"], document["stop"]) == (True, [], "nothing is left")
+        assert (document["success"], document["left"], document["stop"]) == (True, [], "no objects are left")
         assert [(s["object"], s["body"], s["ok"], s["disturbed"]) for s in document["steps"]] == [
             ("o2", "can", True, []),
             ("o1", "crate", True, []),
@@ -234,7 +236,7 @@ class TestCommands:
             command = ["clear", scene_file, "--goal", goal, "--json", "--out", tmp_path / goal, "--no-report"]
             assert run_command(*command, *SMALL, *QUICK) == 0
             document = json.loads(capsys.readouterr().out)
-            assert (document["success"], document["stop"]) == (True, f"{goal} is taken")
+            assert (document["success"], document["stop"]) == (True, f"{goal} is removed")
             assert [step["object"] for step in document["steps"]] == taken
 
     def test_a_recording_cannot_be_cleared(self, recording, capsys, leftovers):

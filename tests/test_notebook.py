@@ -47,7 +47,7 @@ def steps(scene_file, settings):
 def shown(scene, steps, views):
     """One of each kind, and the ends of what they may be."""
     pose = look_at(np.array([-1.0, 0.0, 1.5]), np.zeros(3))
-    safe = TakeStep("o2", (), True, 0.0, "it supports nothing that is left")
+    safe = TakeStep("o2", (), True, 0.0, "it supports no remaining object")
     return {
         "scene": scene,
         "scene of nothing": ct.Scene(),
@@ -135,7 +135,7 @@ def test_facts_are_told(shown, scene, steps):
         "sphere": "⌀ 100 mm",
         "order": "not safe",
         "view": "160 × 120 px",
-        "view of depth": "pose not known",
+        "view of depth": "unknown pose",
         "scene of nothing": "no views yet",
         "first step": steps[0].decision.why,
         "last step": "maximum of 2 views reached",

@@ -180,10 +180,10 @@ def test_it_names_each_object_edge_figure_and_setting(report, html):
         assert figure.caption in page.text
     for said in (
         "View 1", "View 2", "0.900", "F1 over views", "Found so far", "How it went", "no change",
-        "Sees o2 & o7 best", "The graph did not change", "12 too low", "Taken apart", "image_width=160",
+        "Sees o2 & o7 best", "The graph did not change", "12 too low", "Removal", "image_width=160",
         "masks: simulator · caryatid <1>", "3 objects, 4 supports, 2 of them uncertain after 2 views",
-        "Wrong supports: o0 → o2; missing supports: o1 → o7, o0 → lid; objects that are not there: o7; "
-        "objects not found: lid", "wrong 0.50", "missing",
+        "Wrong supports: o0 → o2; missing supports: o1 → o7, o0 → lid; wrong objects: o7; "
+        "missing objects: lid", "wrong 0.50", "missing",
         "160 × 180 × 100", "Run <script>alert(1)</script>", "a<b>.xml", "view <7> & more",
         "the table lies below <o1>", "o1 – o2",
     ):  # fmt: skip
@@ -229,7 +229,7 @@ def test_the_pdf_says_what_the_page_says_and_has_the_same_bytes_each_time(report
     for said in (
         "Run <script>alert(1)</script> $x$", "a<b>.xml", "view <7> & more", "the table lies", "F1 0.900",
         "top-down 0.50", "sees o2 & o7 best", "The graph did not change", "uncertain", "o7", "seen once <i>",
-        "How it went", "F1 over views", "Taken apart", "What the camera saw", "wrong 0.50",
+        "How it went", "F1 over views", "Removal", "Camera image", "wrong 0.50",
     ):  # fmt: skip
         assert said in text, said
 
@@ -249,7 +249,7 @@ def test_charts_need_several_views_or_scores_and_changes_are_said(make_step):
     assert charts([replace(steps[0], robot=stood)]) == ["where the robot stood"]
     assert charts(steps[:1]) == []
     (changed,) = (s.text for s in make_report("t", steps, config=SMALL).sections if s.title == "View 2")
-    assert "now: o1 (box) held by the table, o2 (cylinder) held by o1; gone: o7" in changed
+    assert "now: o1 (box) supported by the table, o2 (cylinder) supported by o1; gone: o7" in changed
     taken = Change("removed", "o2", 1, "empty <space> where it stood")
     page = Page(render_html(make_report("t", [steps[0], replace(steps[1], changes=(taken,))], config=SMALL)))
     assert "o2 was removed: empty <space> where it stood" in page.text
@@ -295,7 +295,7 @@ def test_sizes_stability_and_unseen_sides_are_said():
     assert said["o2"] | {"size [mm]": "⌀ 70 × 100", "supported by": "o1, o0?"} == said["o2"]
     assert rows["o2"]["stability"].doubt
     assert rows["o2"]["residual [mm]"].doubt
-    assert (said["o7"]["supported by"], said["o7"]["size [mm]"]) == ("nothing known", "⌀ 80")
+    assert (said["o7"]["supported by"], said["o7"]["size [mm]"]) == ("unknown", "⌀ 80")
 
 
 # Drawings
@@ -533,7 +533,7 @@ def test_the_page_answers_on_the_first_screen_and_is_short_offline_and_accessibl
         assert max(like) > 20, f"o{label} is not to be seen in 3D"
 
     page.get_by_role("link", name="View 2", exact=True).click()
-    assert page.get_by_text("What the camera saw").nth(1).is_visible()
+    assert page.get_by_text("Camera image").nth(1).is_visible()
     page.evaluate("document.querySelectorAll('details').forEach(part => part.open = true)")
     for scheme in ("light", "dark"):
         page.emulate_media(color_scheme=scheme)

@@ -202,13 +202,13 @@ def test_what_is_said_of_an_object(step, settings):
     text = describe_object(graph, "o1", config)
     for part in ("box", "o0 → o1", "o1 → o2", "Without o1", "o2 falls with probability 1.00:"):
         assert part in text
-    assert "nothing falls" in describe_object(graph, "o2", config)
+    assert "no object falls" in describe_object(graph, "o2", config)
     assert "Without" not in describe_object(graph, "o0", config)
     doubtful = with_supports(step, Support("o1", "o2", certain=False)).graph
     said = "o1 → o2</dt><dd>bottom-up, probability 0.50, uncertain, 1 of 1"
     assert said in describe_object(doubtful, "o1", config)
     assert "not known" in describe_object(graph, "o9", config)
-    assert "has been taken away" in describe_object(graph, "o9", config, taken=True)
+    assert "was removed" in describe_object(graph, "o9", config, taken=True)
     assert "View 1 of 3" in describe_view(step, None, 3)
     assert "finished</dt><dd>enough" in describe_view(replace(step, stop="enough"), None, 1)
     named = replace(step, name="<img src=x onerror=alert(1)>")
@@ -324,7 +324,7 @@ def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(loop, monkeypatch
     loop._running.set()
     said = loop.clear()
     assert said == "finished: " + (
-        "nothing is left; o1 taken; nothing disturbed" if simulated else "a safe order"
+        "no objects are left; o1 removed; nothing disturbed" if simulated else "a safe order"
     )
     rising = next(
         s for s in shown if s and s.graph["o2"].centre_world[2] > step.graph["o2"].centre_world[2] + 0.01
@@ -609,7 +609,7 @@ def test_a_view_is_chosen_by_hand(page, tab):
     def taken_next():
         click(page, eye, tab)
         tab.page.wait_for_timeout(500)
-        return tab.page.get_by_text("your view is next").first.is_visible()
+        return tab.page.get_by_text("next view chosen by hand").first.is_visible()
 
     tab.wait_until(taken_next)  # A click before the page listens is lost.
     tab.press("next view")
@@ -624,7 +624,7 @@ def test_a_view_is_chosen_by_hand(page, tab):
 def test_everything_is_taken_away(page, tab):
     page.describe("o2")
     tab.press("clear")
-    tab.wait_for_text("finished: nothing is left; o1 taken")
+    tab.wait_for_text("finished: no objects are left; o1 removed")
     tab.wait_for_node("/shapes/o1", there=False)
     tab.wait_for_node("/shapes/o2", there=False)
-    tab.wait_for_text("has been taken away")
+    tab.wait_for_text("was removed")

@@ -42,8 +42,8 @@ def format_of(path: Path, wanted: ExportFormat | None = None) -> ExportFormat:
     found = ENDINGS.get(path.suffix.lower())
     if found is None or wanted not in (None, found):
         endings = [ending for ending, format_ in ENDINGS.items() if wanted in (None, format_)]
-        reason = f"does not end as {wanted or 'any format'} does"
-        raise InputError(path, reason, f"end its name in {' or '.join(endings)}")
+        reason = f"the suffix is not that of {wanted or 'any format'}"
+        raise InputError(path, reason, f"use {' or '.join(endings)}")
     return found
 
 
@@ -62,7 +62,7 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
     path, config = Path(path), config or ExportConfig()
     chosen = format_of(path)
     if not graph.objects:
-        raise InputError("the scene model", "holds no objects", "nothing was written")
+        raise InputError("the scene model", "has no objects", "give a graph with objects")
     if len(graph.objects) > config.max_objects:
         reason = f"has {len(graph.objects):,} objects, more than export.max_objects = {config.max_objects:,}"
         raise InputError("the scene model", reason, "raise that setting")
@@ -102,7 +102,7 @@ def _mjcf(graph: SupportGraph, config: ExportConfig) -> str:
         text: str = spec.to_xml()
         mujoco.MjModel.from_xml_string(text)
     except ValueError as error:
-        reason = f"MuJoCo does not take it ({' '.join(str(error).split())})"
+        reason = f"MuJoCo rejects it ({' '.join(str(error).split())})"
         raise InputError("the scene model", reason, "rename objects in graph.json") from error
     return text
 
@@ -113,7 +113,7 @@ def _urdf(graph: SupportGraph, config: ExportConfig) -> str:
     SubElement(robot, "link", name="world")
     for item in graph.objects:
         if item.id == "world":
-            raise InputError("the scene model", "an object is called 'world'", "rename it in graph.json")
+            raise InputError("the scene model", "an object is named 'world'", "rename it in graph.json")
         link = SubElement(robot, "link", name=item.id)
         mass, moments = config.density * item.shape.volume, item.shape.moments
         inertial = SubElement(link, "inertial")

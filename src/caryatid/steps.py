@@ -101,7 +101,7 @@ class RunWriter(StagedFolder):
         labels, folder = step.labels, _view_folder(number)
         if labels.size and not 0 <= labels.min() <= labels.max() <= SUPPORT_LABEL:
             reason = f"labels are not all within 0…{SUPPORT_LABEL}"
-            raise InputError(step.name, reason, "number objects from 1, 0 = nothing")
+            raise InputError(step.name, reason, "number objects from 1, 0 = no object")
         self.write(f"{folder}/graph.json", graph_text(step.graph).encode())
         if labels.ndim == 2:
             self.write(f"{folder}/labels.png", images.png(labels.astype(np.uint16)))
@@ -126,9 +126,9 @@ class RunWriter(StagedFolder):
             super().__exit__()
         if interrupted:
             count = "1 view is" if len(self._views) == 1 else f"{len(self._views)} views are"
-            remedy = f"`caryatid report {self.folder}` makes the report"
+            remedy = f"`caryatid report {self.folder}` writes the report"
             if self._stepwise:
-                remedy = "the same command continues"
+                remedy = "run the same command to continue"
             raise KeyboardInterrupt(f"{count} kept in {self.folder}; {remedy}") from None
 
     def _finish(self, more: dict[str, Any]) -> None:
@@ -181,7 +181,7 @@ class RunView:
             return images.read_units(self.folder / "labels.png")
         labels = images.read_npy(path)
         if labels.ndim != 1 or labels.dtype.kind not in "iu":
-            raise InputError(path, "is not an array of whole numbers (N,)", AGAIN)
+            raise InputError(path, "not an array of integers (N,)", AGAIN)
         return labels.astype(np.int32)
 
 
@@ -223,9 +223,9 @@ def read_run(folder: str | Path) -> Run:
     Raises:
         InputError: It is not a run folder, or a file in it is missing or broken.
     """
-    folder, remedy = Path(folder), "give a folder that a run was written to with --out"
+    folder, remedy = Path(folder), "give a run folder, as written by explore, extract or clear"
     if not folder.is_dir():
-        raise InputError(folder, "is not a folder", remedy)
+        raise InputError(folder, "not a directory", remedy)
     path = folder / "run.json"
     record = read_json(path, remedy)
     count = parse_json(_RunFile, record, path, AGAIN).views
@@ -241,7 +241,7 @@ def read_steps(run: Run) -> Iterator[Step]:
     """
     if run.record["version"] == 1:
         ours = run.record.get("versions", {}).get("caryatid", "0.1.0")
-        reason = f"was written by caryatid {ours}, which kept no views"
+        reason = f"written by caryatid {ours}, which did not store views"
         remedy = "repeat the run; order, evaluate and export need only its graph"
         raise InputError(run.folder, reason, remedy)
     return (_read_step(view.folder) for view in run.views)
@@ -270,7 +270,7 @@ def _own_files(folder: Path) -> set[str]:
         return set()
     files = read_json(folder / "run.json").get("files")
     if files is None:
-        reason = "holds a run of an earlier caryatid, which does not list its files"
+        reason = "contains a run of an earlier caryatid, which does not list its files"
         raise InputError(folder, reason, "move or delete the folder, or give a new one")
     return {"run.json", "report.html", *map(str, files)}
 
@@ -368,7 +368,7 @@ def _read_step(folder: Path) -> Step:
         step = Step(**_decoded(document, arrays), graph=read_graph(folder / "graph.json"))
         return _with_cloud(step, np.float64)
     except Exception as error:  # a damaged archive raises almost anything
-        raise InputError(path, f"is not a step of a run ({' '.join(str(error).split())})", remedy) from error
+        raise InputError(path, f"not a step of a run ({' '.join(str(error).split())})", remedy) from error
 
 
 def _decoded(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:

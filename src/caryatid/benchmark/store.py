@@ -79,7 +79,7 @@ class ResultStore:
         self._lock = FileLock(f"{path}.lock", timeout=0)
         if fingerprint is None:
             if not path.is_file():
-                raise InputError(path, "there is no result file", "run a suite first: --suite NAME")
+                raise InputError(path, "the file is missing", "run a suite first: --suite NAME")
             self._read()
             return
         try:
@@ -157,8 +157,8 @@ class ResultStore:
             self._lock.acquire()
             self._file = self.path.open("ab")
         except Timeout:
-            remedy = "wait until it ends, or choose another --out"
-            raise InputError(self.path, "another run is writing to it", remedy) from None
+            remedy = "wait until it finishes, or choose another --out"
+            raise InputError(self.path, "in use by another process", remedy) from None
         except OSError as error:
             raise InputError(self.path, f"cannot be opened ({error})", "choose another folder") from None
 
@@ -189,8 +189,8 @@ class ResultStore:
             self.about = about
         elif self.about.get("format") != FORMAT or self.about["fingerprint"] != about["fingerprint"]:
             names = " ".join(self.about[n] for n in ("version", "commit", "fingerprint") if n in self.about)
-            reason = f"was made by other code ({names}), whose figures are not comparable"
-            raise InputError(self.path, reason, "choose another --out, or draw it as it is without --suite")
+            reason = f"results are not comparable, because the code differs ({names})"
+            raise InputError(self.path, reason, "choose another --out, or omit --suite to draw them anyway")
 
     def _append(self, line: dict[str, Any]) -> None:
         assert self._file is not None, "this store was opened for reading"

@@ -10,7 +10,7 @@ from caryatid.graph import TakeStep
 from caryatid.manipulation.order import plan_order
 
 MISSES = 2
-"""Maximum number of lifts in a row that remove nothing [1]: the model is then wrong."""
+"""Number of lifts in a row that remove nothing after which clearing stops [1]: the model is then wrong."""
 
 
 def clear(
@@ -22,20 +22,20 @@ def clear(
     threads: int = 1,
     past: Iterable[Step] = (),
 ) -> Iterator[Step]:
-    """Look until the next lift is safe, lift, look again, until nothing or nothing safe is left.
+    """Look until the next lift is safe, lift, and repeat until no object or no safe lift is left.
 
-    A lift is safe if no other object moves with a higher probability than `config.rehearsal.risk`, as in
-    `plan_order`. It is done when no view is expected to show more of what it depends on than its path costs,
-    or after `config.active.max_views` views since the previous lift. After each lift the robot looks again,
-    and so notices what slid or fell.
+    A lift is safe if no other object moves with a probability above `config.rehearsal.risk`, as in
+    `plan_order`. It is carried out when no view of what it depends on is worth its path, or after
+    `config.active.max_views` views since the previous lift. After each lift the robot looks again, and so
+    detects objects that slid or fell.
 
     Args:
-        explorer: Has a camera and a robot, and no goal.
-        take: Removes an object; returns whether it was there.
-        goal: Id of the object to reach; None = all of them.
+        explorer: Explorer with a camera and a robot, without a goal.
+        take: Removes an object; returns whether it was in place.
+        goal: Id of the object to reach; None = remove all.
         hands: 2 if another hand can hold one object, else 1.
-        threads: Number of rehearsals at a time.
-        past: Steps of a run to continue; their views are used again, and nothing is removed again.
+        threads: Number of parallel rehearsals.
+        past: Steps of a run to continue; their views are reused, and nothing is removed again.
 
     Yields:
         A step after each view and its lift; `lift` names the removed object.
@@ -59,9 +59,9 @@ def clear(
             explorer.goal = goal
             explorer.plan()
             if lift.object_id == goal and not missed:
-                reason = f"{goal} is taken"
+                reason = f"{goal} is removed"
             elif missed == MISSES:
-                reason = f"nothing was there to take, {MISSES} times in a row"
+                reason = f"{MISSES} lifts in a row found no object in place"
         assert explorer.step is not None
         step = replace(explorer.step, lift=lift)
         if reason is not None:
@@ -77,7 +77,7 @@ def _lift(
     scene = explorer.scene
     ids = [o.id for o in scene.graph.objects if o.role == "object"]
     if not ids and goal is None:
-        return None, "nothing is left"
+        return None, "no objects are left"
     lift = None
     if goal is None or goal in ids:
         order = plan_order(
@@ -90,7 +90,7 @@ def _lift(
     if reason is None:
         return None, None
     if lift is None:
-        return None, f"{reason}; {goal} has not been found"
+        return None, f"{reason}; {goal} was not found"
     return (lift, None) if lift.safe else (None, f"no lift is safe: {lift.why}")
 
 

@@ -20,15 +20,15 @@ from caryatid.simulation.world import SimulatedScene, posed, poses_of
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Taken:
-    """One step of an order, done.
+    """Outcome of one step of an order.
 
     Attributes:
         step: The step of the order.
-        body: Name of the lifted body; None if there is none at the extracted object's place.
-        held: Names of the bodies that were held meanwhile.
-        disturbed: Names of the bodies that were moved or turned beyond the limits.
-        film: States (T, N, 7) of the scene's objects on the way; empty if nothing was lifted.
-        bodies: Body that each extracted object stood for, by id.
+        body: Name of the lifted body; None if no body matches the extracted object.
+        held: Names of the bodies held during the lift.
+        disturbed: Names of the bodies that moved or turned beyond the limits.
+        film: States (T, N, 7) of the scene's objects during the lift; empty if nothing was lifted.
+        bodies: Body that each extracted object represented, by id.
     """
 
     step: TakeStep
@@ -40,7 +40,7 @@ class Taken:
 
     @property
     def ok(self) -> bool:
-        """Nothing was disturbed."""
+        """Whether no object was disturbed."""
         return not self.disturbed
 
     def to_json(self) -> dict[str, Any]:
@@ -64,7 +64,7 @@ class SimulatedHands:
 
     Args:
         scene: The scene in physics; it is not changed.
-        config: How objects are lifted, and what counts as harm.
+        config: Settings of lifts, and limits beyond which an object was disturbed.
 
     Attributes:
         names: Names (N) of the scene's objects.
@@ -84,7 +84,7 @@ class SimulatedHands:
 
     @property
     def left(self) -> list[str]:
-        """Names of the bodies that have not been taken."""
+        """Names of the bodies that are still on the table."""
         return [n for n, z in zip(self.names, self.state[:, 2], strict=True) if z < ASIDE / 2.0]
 
     def bodies(self, graph: SupportGraph) -> dict[str, str]:
@@ -95,7 +95,7 @@ class SimulatedHands:
         """Carry out a step, even if it disturbs others.
 
         Args:
-            step: What to take.
+            step: The step to carry out.
             bodies: Body that each extracted object represents, by id.
         """
         body, left = bodies.get(step.object_id), self.left

@@ -1,13 +1,13 @@
-"""A safe order of removal: each step is rehearsed in physics before it is chosen.
+"""A safe removal order: each step is rehearsed in physics before it is chosen.
 
 Extracted shapes are not exactly at rest in physics, and friction and weights are unknown. So a lift is
-rehearsed in several scenes, drawn from the shapes' uncertainty, each of which first comes to rest. An object
-that does not, although the real one was seen at rest, has a wrong shape or rests on something unseen. It is
-held there, and the support graph alone says what it needs.
+rehearsed in several scenes, sampled from the shapes' uncertainty, each of which first comes to rest. An
+object that does not come to rest, although the real one was at rest, has a wrong shape or an unseen support.
+It is held in place, and its supports are taken from the support graph alone.
 
-The risk of a lift is the probability that the next scene drawn, such as the real one, shows harm. After n
-scenes with harm h in all, it is (h + ½) / (n + 1): the mean of a Beta distribution that begins as Jeffreys'
-prior, Beta(½, ½). Scenes are drawn until the risk is low enough, or can no longer become so.
+The risk of a lift is the probability that it disturbs another object in the next scene, such as the real one.
+After n scenes with total harm h, it is (h + ½) / (n + 1): the posterior mean with Jeffreys' prior,
+Beta(½, ½). Scenes are sampled until the risk is low enough, or can no longer become so.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ BATCH = 8
 
 @dataclass(frozen=True, slots=True)
 class Order(Pictured):
-    """An order of removal.
+    """A removal order.
 
     Attributes:
-        steps: The objects to remove, one after the other.
-        refusal: Why there is no safe order, and which objects block each other; empty if there is one.
+        steps: The objects to remove, in order.
+        refusal: Why no order is safe, and which objects block each other; empty for a safe order.
     """
 
     steps: tuple[TakeStep, ...]
@@ -57,7 +57,7 @@ class Order(Pictured):
         return f"Order({taken}; {self.refusal or 'safe'})"
 
     def to_json(self) -> dict[str, Any]:
-        """Its steps, whether it is safe, and why not."""
+        """The steps, whether they are safe, and why not."""
         steps = [step.to_json() for step in self.steps]
         return {"steps": steps, "safe": self.safe, "refusal": self.refusal or None}
 
@@ -72,25 +72,25 @@ def plan_order(
     seed: int = 0,
     threads: int = 1,
 ) -> Order:
-    """Find a safe order in which to remove everything, or to reach one object.
+    """Find a safe order in which to remove all objects, or to reach one.
 
-    Greedy: the next object is one whose lift disturbs another one with a probability of at most
-    `rehearsal.risk`; objects that support nothing come first, and higher ones before lower ones. If there is
-    none, the other hand holds the object that would be disturbed most. If that does not help either, the
+    Greedy: the next object is one whose lift disturbs another with a probability of at most
+    `rehearsal.risk`; objects that support nothing come first, and higher ones before lower ones. If no lift
+    is safe, the other hand holds the object that would be disturbed most. If that does not help either, the
     least risky lift is chosen, and the order is not safe.
 
     Args:
         graph: The extracted graph.
-        config: How lifts go, and how they are rehearsed.
-        goal: Id of the object to reach; only objects that must go first are removed.
+        config: Settings of lifts and rehearsals.
+        goal: Id of the object to reach; only objects in its way are removed.
         hands: 2 if another hand can hold one object, else 1.
         steps: Maximum number of steps; None = all.
         seed: Seed of the rehearsals.
-        threads: Number of rehearsals at a time.
+        threads: Number of parallel rehearsals.
 
     Raises:
-        InputError: There is no support surface, no object, more than `rehearsal.max_objects` of them, or no
-            such goal.
+        InputError: The graph has no support surface, no objects, or more than `rehearsal.max_objects`; or
+            the goal is unknown.
     """
     rehearsal = _Rehearsal(graph, config or Config(), seed, threads)
     if goal is not None and goal not in rehearsal.ids:
@@ -153,7 +153,7 @@ def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_
 
 def _step(graph: SupportGraph, trial: _Trial, left: Sequence[str], accepted: float) -> TakeStep:
     carried = [s.supported for s in graph.supports if s.supporter == trial.object_id and s.supported in left]
-    what = f"supports {', '.join(carried)}" if carried else "supports nothing that is left"
+    what = f"supports {', '.join(carried)}" if carried else "supports no remaining object"
     with_hold = f" while {', '.join(trial.hold)} is held" if trial.hold else ""
     worst = ", ".join(f"{i} with probability {share:.2f}" for i, share in trial.harmed.items())
     why = f"it {what}; lifting it{with_hold} disturbed {worst or 'nothing'} in {trial.rehearsals} rehearsals"
@@ -169,7 +169,7 @@ def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
         harm = ", ".join(trial.harmed) or "nothing, but rehearsal.draws are too few for the risk"
         return f"no safe order: lifting {trial.object_id} disturbs {harm}"
     cycle = ", ".join(f"lifting {a} disturbs {b}" for a, b in edges)
-    return f"no safe order: {cycle}; whichever goes first"
+    return f"no safe order: {cycle}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,14 +188,14 @@ class _Rehearsal:
 
     def __init__(self, graph: SupportGraph, config: Config, seed: int, threads: int) -> None:
         if graph.support_surface is None:
-            raise InputError("graph", "has no support surface", "extract one; lifts need a table")
+            raise InputError("graph", "has no support surface", "give a graph with a table")
         self.ids = tuple(o.id for o in graph.objects if o.role == "object")
         if not self.ids:
-            raise InputError("graph", "has no objects", "there is nothing to take away")
+            raise InputError("graph", "has no objects", "give a graph with objects to remove")
         if len(self.ids) > config.rehearsal.max_objects:
             reserved = 0.6 * (len(self.ids) / 300) ** 1.7  # two arenas [GB], measured with 300 and 1,000
             reason = (
-                f"has {len(self.ids)} objects, for which MuJoCo reserves about {reserved:.1f} GB a thread"
+                f"has {len(self.ids)} objects, for which MuJoCo reserves about {reserved:.1f} GB per thread"
             )
             raise InputError("graph", reason, "raise rehearsal.max_objects, or give a part of the scene")
         self.graph, self._config, self._seed, self._threads = graph, config, seed, threads

@@ -1,4 +1,4 @@
-"""The viewer: a page in the browser that shows what is known after each view, and works the loop.
+"""The viewer: a page in the browser that shows the scene after each view and controls the loop.
 
 `show` opens one for a `Scene`; `caryatid view` for a run, a scene or a recording. Needs the extra `view`.
 """

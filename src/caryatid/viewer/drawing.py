@@ -1,4 +1,4 @@
-"""What the page's scene shows of a step, drawn with viser's own primitives."""
+"""The 3D scene of a step, drawn with viser's primitives."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ LAYERS = {
     "shapes": True, "names": True, "supports": True, "cameras": True,
     "cloud": False, "sphere": False, "interest": False, "robot": False,
 }  # fmt: skip
-"""What can be shown and hidden, and whether it shows at first."""
+"""Layers that can be shown and hidden, and whether they are visible at first."""
 CERTAIN, UNCERTAIN = (26, 32, 40), (196, 78, 12)
 """Colours of supports; uncertain ones are dashed too."""
 EARLIER, NEXT, BY_HAND = (128, 136, 146), (11, 92, 148), (170, 30, 120)
 """Colours of earlier views, the planner's choice, and one by hand."""
 EARLIER_POINTS = 10_000
-"""Points that are kept of the cloud after an earlier view, so that 200 views take less than 100 MB [1]."""
+"""Points kept of the cloud of an earlier view, so that 200 views take less than 100 MB [1]."""
 ARROW = {"shaft_radius": 0.0035, "head_radius": 0.0095, "head_length": 0.02}
 """Sizes of an arrow at 1 m from the eye [m]."""
 LETTER = 0.03

@@ -1,4 +1,4 @@
-"""A page that controls an exploration: turn by turn, with any planner and fusion, until it is cleared."""
+"""A page that controls an exploration step by step, with any planner and fusion, and clears the table."""
 
 from __future__ import annotations
 
@@ -39,27 +39,27 @@ if TYPE_CHECKING:
 
 
 class LoopPage(Page):
-    """A page with an exploration whose turns a person asks for, and the one thread that takes them.
+    """A page that explores a source at the user's request, in one worker thread.
 
-    The exploration continues until the user stops; the page says when `explore` would have ended.
+    The exploration continues until the user stops it; the page shows when `explore` would have stopped.
 
     Args:
-        open_source: Opens what is explored, again each time, for some settings.
-        config: All settings; `config.active.max_views` is when `run` pauses.
+        open_source: Opens the source with the given settings; called again after a change of fusion.
+        config: All settings; `run` pauses after `config.active.max_views` views.
         planner: Name of the planner.
-        segmentation: Where segments come from.
+        segmentation: `labels`, `auto`, or None to use labels if available.
         seed: Seed of every random choice.
-        masks: Gives views their masks, or None to take them as they come.
-        host: Address to listen at.
-        port: Port to listen at, or the next free one; 0 = any that is free.
+        masks: Source of masks, or None to use those of the views.
+        host: Address to listen on.
+        port: Port to listen on; if taken, the next free one; 0 = any free port.
 
     Attributes:
-        source: What is explored.
+        source: The scene or recording.
         planner: Name of the planner.
         ended: Why no further view can be taken, or None.
 
     Raises:
-        CaryatidError: The source cannot be opened, there is no such planner, or the page cannot be served.
+        CaryatidError: The source cannot be opened, the planner is unknown, or the page cannot be served.
     """
 
     def __init__(
@@ -93,11 +93,11 @@ class LoopPage(Page):
         self.ended: str | None = None
 
     def _named(self, name: str) -> Any:
-        """The planner of this name; the oracle belongs to the source, and so only the first can be it."""
+        """The planner of this name; the oracle depends on the source, so only the first planner can be it."""
         return self._first if name == self._began_with else name
 
     def turn(self) -> str | None:
-        """Go to the next view, look and plan; return why `explore` would have ended now, or None.
+        """Go to the next view, look and plan; return why `explore` would stop now, or None.
 
         Raises:
             CaryatidError: The view cannot be used.
@@ -118,10 +118,10 @@ class LoopPage(Page):
         return used_up(len(self.steps), self._config.active) or explorer.reason_to_stop()
 
     def use_planner(self, name: str) -> str:
-        """Let another planner choose, already the next view; return what to say about it.
+        """Replace the planner, starting with the next view; return a message.
 
         Raises:
-            CaryatidError: There is no such planner, or it can choose no view.
+            CaryatidError: The planner is unknown, or finds no next view.
         """
         with self.working:
             self._explorer.use_planner(self._named(name))
@@ -130,13 +130,13 @@ class LoopPage(Page):
                 return ""
             step = self._explorer.plan()
         if step.decision is None:
-            raise PlanningError(step.stop or "no view can be chosen")
+            raise PlanningError(step.stop or "the planner found no next view")
         self._planned = step.decision
         self._put(step)
-        return f"{name} chose the next view"
+        return f"next view chosen by {name}"
 
     def use_fusion(self, method: FusionMethod) -> str:
-        """Begin again with another fusion and take the same views again; return what to say about it."""
+        """Restart with another fusion and repeat the same views; return a message."""
         earlier = [step.decision for step in self.steps]
         self._config = replace(self._config, fusion=replace(self._config.fusion, method=method))
         with self.working:
@@ -145,34 +145,34 @@ class LoopPage(Page):
             self.turn()
             if number < len(earlier) and decision is not None and self.ended is None:
                 self.choose(decision)
-        return f"the same views, fused by {method}"
+        return f"same views, fusion {method}"
 
     def choose(self, chosen: Decision | int) -> str:
-        """Take this view or candidate next, whatever the planner says; return what to say about it.
+        """Override the planner's choice of the next view; return a message.
 
         Raises:
-            PlanningError: There is no next view to choose, or the robot cannot take it.
+            PlanningError: The candidate does not exist, or the robot refuses it.
         """
         with self.working:
             step = self._explorer.choose(chosen)
         self._put(step)
         if self._planned is None or step.decision is None:
-            return "your view is next"
+            return "next view chosen by hand"
         yours, planned = step.decision.score, self._planned.score
-        return f"your view is next: score {yours:.2f}, the choice of {self.planner} {planned:.2f}"
+        return f"next view chosen by hand: score {yours:.2f}; {self.planner} chose one with {planned:.2f}"
 
     def _put(self, step: Step) -> None:
         """Show the newest step with another next view."""
         self.add(step, self.scores[step.index])
 
     def clear(self) -> str:
-        """Clear the table in physics, as `clear` does; of a recording, show the lifts of a safe order."""
+        """Clear a simulated table, as `clear` does; for a recording, show a safe order."""
         explorer, config, camera = self._explorer, self._config, self.source.camera
         if not isinstance(camera, SimulatedCamera):
             return self._show_order(self.steps[-1], config)
         hands, said = SimulatedHands(camera.scene, config), ""
         film: list[Step] = []
-        self.source = replace(self.source, truth=None)  # It is that of the scene as it was.
+        self.source = replace(self.source, truth=None)  # Ground truth is of the scene before any lift.
 
         def take(lift: TakeStep) -> bool:
             nonlocal said
@@ -181,7 +181,7 @@ class LoopPage(Page):
             taken = hands.take(lift, hands.bodies(step.graph))
             film.extend(_without(step, (), lift.object_id, T) for T in _moves(taken, hands.names, before))
             camera.scene = hands.scene
-            said = f"{lift.object_id} taken; {', '.join(taken.disturbed) or 'nothing'} disturbed"
+            said = f"{lift.object_id} removed; {', '.join(taken.disturbed) or 'nothing'} disturbed"
             return taken.body is not None
 
         steps = clear(explorer, take, threads=cores())
@@ -214,20 +214,20 @@ class LoopPage(Page):
     def _show(self, film: Iterable[Step]) -> None:
         for picture in film:
             self.stage(picture)
-            time.sleep(0.12)  # Each picture of a lift stands for so long [s].
+            time.sleep(0.12)  # Time for which each picture of a lift is shown [s].
 
     def start(self) -> None:
-        """Take the first view, or the next, in the page's own thread."""
+        """Take the first or the next view in the worker thread."""
         self._running.clear()
         self._do("taking a view", lambda: _finished(self.turn()))
 
     def wait(self) -> None:
-        """Wait until all that has been asked for is done and drawn."""
+        """Wait until all requests are done and drawn."""
         self._worker.submit(lambda: None).result()
         super().wait()
 
     def close(self) -> None:
-        """Stop, once the view that is being taken is there, and stop serving the page."""
+        """Finish the current view, then stop serving the page."""
         self._worker.shutdown(wait=False, cancel_futures=True)
         self._running.clear()
         self._worker.shutdown()
@@ -237,36 +237,36 @@ class LoopPage(Page):
         gui = self.server.gui
         names = [*BUILT_IN, *sorted(offered()), *([ORACLE] if self.planner == ORACLE else [])]
         with gui.add_folder("loop", order=-10):
-            self._next = gui.add_button("next view", hint="Take one turn of the loop")
-            self._go = gui.add_button("run", hint="Take turn after turn")
-            self._pause = gui.add_button("pause", hint="Stop after this turn", disabled=True)
+            self._next = gui.add_button("next view", hint="Move to the next view and take it")
+            self._go = gui.add_button("run", hint="Take views until the exploration would stop")
+            self._pause = gui.add_button("pause", hint="Stop after the current view", disabled=True)
             planner = gui.add_dropdown("planner", names, initial_value=self.planner)
             fusion = gui.add_dropdown(
                 "fusion", get_args(FusionMethod), initial_value=self._config.fusion.method
             )
-            hint = "Then click the view sphere: the view you point at is taken next"
+            hint = "Click the view sphere to choose the next view"
             by_hand = gui.add_checkbox("choose the next view by hand", False, hint=hint)
-            hint = "Look until a lift is safe, take the object, look again, until nothing is left"
+            hint = "Remove all objects: look until a lift is safe, remove the object, look again"
             self._clear = gui.add_button("clear", hint=hint)
         self._choices = planner, fusion
         self._next.on_click(lambda _: self.start())
         self._go.on_click(lambda _: self._keep_doing("running", self._run))
         self._pause.on_click(lambda _: self._running.clear())
         self._clear.on_click(lambda _: self._keep_doing("clearing", self.clear))
-        planner.on_update(lambda _: self._do("planning again", lambda: self.use_planner(planner.value)))
+        planner.on_update(lambda _: self._do("replanning", lambda: self.use_planner(planner.value)))
         fusion.on_update(
-            lambda _: self._do("taking the same views again", lambda: self.use_fusion(fusion.value))
+            lambda _: self._do("repeating the same views", lambda: self.use_fusion(fusion.value))
         )
         by_hand.on_update(lambda _: self._listen(by_hand.value))
 
     def _keep_doing(self, what: str, work: Callable[[], str | None]) -> None:
-        """Have work done that `pause` ends."""
+        """Queue work that `pause` can stop."""
         if not self._running.is_set():
             self._running.set()
             self._do(what, work)
 
     def _do(self, what: str, work: Callable[[], str | None]) -> None:
-        """Have work done, after what is being done, and say what it returns at its end."""
+        """Queue work, and show the message that it returns."""
 
         def done() -> None:
             self._show_state(what + " …", busy=True)
@@ -304,7 +304,7 @@ class LoopPage(Page):
         self.show_layer("sphere", wanted)
         if wanted and self.steps:
             sphere = self.steps[-1].sphere
-            for client in self.server.get_clients().values():  # Back to where the whole sphere is in sight.
+            for client in self.server.get_clients().values():  # Move back until the whole sphere is visible.
                 away = transforms.unit(np.array(client.camera.position) - sphere.centre_world)
                 client.camera.position = sphere.centre_world + 2.7 * sphere.radius * away
                 client.camera.look_at = sphere.centre_world
@@ -312,7 +312,7 @@ class LoopPage(Page):
             scene.on_click()(self._pointed)
 
     def _pointed(self, event: Any) -> None:
-        """Take the candidate within 6° of a click next, whatever the planner says."""
+        """Choose the candidate within 6° of a click as the next view."""
         step = self._explorer.step
         if step is None or step.candidates is None:
             return

@@ -1,4 +1,4 @@
-"""The page: the scene after each view, a slider over the views, and what is known beside it."""
+"""The page: the scene after each view, a slider over the views, and panels with details."""
 
 from __future__ import annotations
 
@@ -41,23 +41,23 @@ from caryatid.viz.tables import census, object_table, support_table
 class Page:
     """A viewer in the browser, served by this process.
 
-    Steps are added from any thread and drawn in the page's own thread; if they arrive faster than they can be
-    drawn, only the newest is.
+    Steps are added from any thread and drawn in the page's thread; if they arrive faster than they can be
+    drawn, only the newest is drawn.
 
     Args:
-        title: What the page is of.
-        support: Settings that the graphs were inferred with, to predict what falls.
-        host: Address to listen at; at 127.0.0.1 only programs on this machine can connect.
-        port: Port to listen at, or the next free one; 0 = any that is free.
-        small: The page has little room, as in a notebook: panels are folded at first.
+        title: Title of the page.
+        support: Settings with which the graphs were inferred, to predict which objects fall.
+        host: Address to listen on; on 127.0.0.1, only programs on this machine can connect.
+        port: Port to listen on; if taken, the next free one; 0 = any free port.
+        small: Fold the panels at first, for a small page such as in a notebook.
 
     Attributes:
         url: Address of the page, with the token that it requires.
         server: The `viser.ViserServer`, to add controls to.
         drawing: The scene in the page.
         steps: The steps added so far.
-        scores: F1 after each step, or None where the ground truth is not known.
-        working: Lock for compiled kernels: not every threading layer lets two threads run them.
+        scores: F1 after each step, or None without ground truth.
+        working: Lock for compiled kernels: not every threading layer allows two threads to run them.
 
     Raises:
         InputError: viser is not installed, or the page cannot be served.
@@ -93,12 +93,12 @@ class Page:
         self.server.on_client_connect(self._follow)
 
     def say(self, text: str) -> None:
-        """Show a message at the top of the page, in place of the one before."""
+        """Show a message at the top of the page, replacing the previous one."""
         self._notice.content = cell_html(Section("", text))
         self._notice.visible = bool(text)
 
     def add(self, step: Step, f1: float | None = None) -> None:
-        """Add a step, or replace that of the same view; a page that shows the newest step moves to it."""
+        """Add a step, or replace the step of the same view; a page at the newest step follows."""
         newest = self._shown == len(self.steps) - 1
         if step.index == len(self.steps) > 0:
             self.steps[-1] = thinned(self.steps[-1])
@@ -111,7 +111,7 @@ class Page:
         self.redraw()
 
     def update(self, scene: Scene) -> None:
-        """Add what a scene knows now; the slider goes back to earlier states."""
+        """Add the current state of a scene; the slider goes back to earlier states."""
         if scene.views:
             self.add(step_of_scene(scene))
 
@@ -122,7 +122,7 @@ class Page:
         self.redraw()
 
     def go_to(self, index: int) -> None:
-        """Show what was known after a view."""
+        """Show the scene after a view."""
         index = min(max(index, 0), len(self.steps) - 1)
         if index != self._shown:
             self._shown = index
@@ -130,12 +130,12 @@ class Page:
             self.redraw()
 
     def describe(self, object_id: str) -> None:
-        """Show what is known of an object."""
+        """Show the details of an object."""
         self._chosen = object_id
         self.redraw()
 
     def stage(self, step: Step | None) -> None:
-        """Show a step without adding it; None shows the added ones again."""
+        """Show a step without adding it; None returns to the added steps."""
         if step is not self._staged:
             self._staged = step
             self.redraw()
@@ -153,7 +153,7 @@ class Page:
         return pending
 
     def wait(self) -> None:
-        """Wait until everything is drawn; errors of drawing are raised."""
+        """Wait until everything is drawn, and raise drawing errors."""
         self._drawer.submit(lambda: None).result()
         if self._pending is not None:
             self._pending.result()
@@ -167,7 +167,7 @@ class Page:
             self.server.stop()
 
     def _repr_html_(self) -> str:
-        """The page within a notebook."""
+        """The page in a notebook cell."""
         return f'<iframe src="{escape(self.url)}" width="100%" height="620" style="border:0"></iframe>'
 
     def _build(self) -> None:
@@ -183,7 +183,7 @@ class Page:
             for name, shown in LAYERS.items():
                 box = self._boxes[name] = gui.add_checkbox(name, shown)
                 box.on_update(lambda event, name=name: self.show_layer(name, event.target.value))
-            self._true_colours = gui.add_checkbox("colours of the camera", False)
+            self._true_colours = gui.add_checkbox("camera colours", False)
             self._size = gui.add_slider("point size [mm]", 1.0, 12.0, 0.5, 3.0)
         for control in (self._true_colours, self._size):
             control.on_update(lambda _: self.redraw())
@@ -191,11 +191,11 @@ class Page:
         with panel.add_tab("supports"):
             self._graph = gui.add_html("")
         with panel.add_tab("F1"):
-            self._chart = gui.add_html(cell_html(Section("", "The ground truth is not known here.")))
+            self._chart = gui.add_html(cell_html(Section("", "No ground truth available.")))
         with panel.add_tab("key"):
             gui.add_html(_describe_signs())
         with about.add_tab("object"):
-            hint = "Click an object in the scene to see what is known of it."
+            hint = "Click an object in the scene to see its details."
             self._about = gui.add_html(cell_html(Section("", hint)))
         panel.dock_left()
         panel.set_width(380)
@@ -206,7 +206,7 @@ class Page:
             gui.main_panel.dock_right()
 
     def _look_at(self, step: Step) -> None:
-        """Have the eye begin before the objects, over the shoulder of the first camera."""
+        """Place the initial viewpoint in front of the objects, beside the first camera."""
         x, y = step.visited[0][:2] if len(step.visited) else (-1.0, 0.0)
         azimuth = float(np.arctan2(y + 0.5 * x, x - 0.5 * y))
         outlines = [item.shape.outline() for item in step.graph.objects if item.role == "object"]
@@ -215,12 +215,12 @@ class Page:
         centre, reach = (low + high) / 2.0, max(float(np.linalg.norm(high - low)) / 2.0, 0.15)
         camera = self.server.initial_camera
         camera.look_at = centre
-        camera.fov = 0.72  # Narrow, so that what is near does not hide what is far [rad].
-        camera.position = centre + 3.2 * reach * direction(azimuth, 0.55)  # 3.2 radii away, all fits in.
+        camera.fov = 0.72  # Narrow, so that near objects do not hide far ones [rad].
+        camera.position = centre + 3.2 * reach * direction(azimuth, 0.55)  # From 3.2 radii, all objects fit.
         self._T_world_eye = transforms.look_at(camera.position, centre)
 
     def _follow(self, client: Any) -> None:
-        """Keep names and arrows turned to a client's eye."""
+        """Keep names and arrows facing a client's camera."""
 
         def moved(camera: Any) -> None:
             rotation = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
@@ -230,7 +230,7 @@ class Page:
         client.camera.on_update(moved)
 
     def _drive(self) -> None:
-        """Move the robot on along its way, and again soon until it is there."""
+        """Move the robot along its path, and schedule the next move until it arrives."""
         if self.drawing.robot is not None and self.drawing.robot.drive():
             time.sleep(0.03)
             self._driving = self._soon(self._driving, self._drive)
@@ -268,15 +268,15 @@ class Page:
 
 
 def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
-    """Open a page that shows what a scene knows.
+    """Open a page that shows a scene.
 
     Args:
-        scene: Of any number of views.
-        host: Address to listen at; at 127.0.0.1 only programs on this machine can connect.
-        port: Port to listen at, or the next free one; 0 = any that is free.
+        scene: A scene with any number of views.
+        host: Address to listen on; on 127.0.0.1, only programs on this machine can connect.
+        port: Port to listen on; if taken, the next free one; 0 = any free port.
 
     Returns:
-        The page with its `url`, `update(scene)` and `close()`; within a notebook it shows itself.
+        The page with its `url`, `update(scene)` and `close()`; a notebook displays it.
 
     Raises:
         InputError: viser is not installed.
@@ -290,7 +290,7 @@ def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
 
 
 def describe_view(step: Step, f1: float | None, count: int) -> str:
-    """Describe what is known after a view, and where to look next."""
+    """Describe the scene after a view, and the next view."""
     facts = [] if f1 is None else [("F1", f"{f1:.3f}")]
     if step.decision is not None:
         facts.append(("next", step.decision.why))
@@ -301,31 +301,29 @@ def describe_view(step: Step, f1: float | None, count: int) -> str:
 
 
 def _describe_signs() -> str:
-    """Explain the signs in the scene."""
+    """Explain the symbols in the scene."""
     signs = {
-        "Arrow": "supporter → supported, thicker where more probable; dashed where uncertain. "
-        "From the table only where uncertain",
-        "Number on an arrow": "the probability of the support, where it is less than 1",
-        "Dots on the sphere": "where the robot can bring its camera, coloured by saliency",
-        "Fine grey dots": "where it cannot",
-        "Balls with rays": "points of interest, and from where they are seen best",
-        "Grey cameras": "views so far, with what they saw; the newest is black and larger",
-        "Filled camera": "the next view: blue the planner's choice, pink one by hand",
+        "Arrow": "supporter → supported; thicker = more probable, dashed = uncertain. "
+        "Certain supports by the table are not drawn",
+        "Number on an arrow": "probability of the support, if below 1",
+        "Coloured dots on the sphere": "candidate views that the robot can reach, coloured by saliency",
+        "Fine grey dots": "views out of reach",
+        "Balls with rays": "points of interest, and the views that show them best",
+        "Grey cameras": "earlier views with their images; the newest is black and larger",
+        "Filled camera": "next view: blue = chosen by the planner, pink = chosen by hand",
     }
     picture = draw_layers("saliency", [scale(np.tile(np.linspace(-1.0, 1.0, 340), (10, 1)), SALIENCY_STOPS)])
-    caption = "Saliency: seen before, nothing, look here; the highest of each view is red."
+    caption = "Saliency: from low (already seen) to high (look here); the maximum of each view is red."
     return cell_html(Section("Key", facts=[*signs.items()], figures=[Figure("", picture, caption)]))
 
 
 def describe_object(
     graph: SupportGraph, object_id: str, config: SupportConfig, *, taken: bool = False
 ) -> str:
-    """Describe an object: its edges, what falls without it, size and fit; or that it has been taken away."""
+    """Describe an object: its edges, what falls without it, size and fit; or that it was removed."""
     item = next((o for o in graph.objects if o.id == object_id), None)
     if item is None:
-        return cell_html(
-            Section(object_id, "has been taken away" if taken else "is not known after this view")
-        )
+        return cell_html(Section(object_id, "was removed" if taken else "not found up to this view"))
     facts = []
     for supporter, supported, kind, likely, found, why in support_table(graph).rows:
         if object_id in (supporter.text, supported.text):
@@ -334,7 +332,7 @@ def describe_object(
     if item.role == "object":
         effects = predict_removal(graph, object_id, config)
         falls = [f"{e.object_id} falls with probability {e.probability:.2f}: {e.why}" for e in effects]
-        facts += [(f"Without {object_id}", text) for text in falls or ["nothing falls"]]
+        facts += [(f"Without {object_id}", text) for text in falls or ["no object falls"]]
     table = object_table(graph)
     (row,) = (row for row in table.rows if row[0].text == object_id)
     facts += [(name, e.text) for name, e in zip(table.columns, row, strict=True) if e.text][2:]
@@ -370,7 +368,7 @@ class PageProcess:
         try:
             self.url: str = self._connection.recv()
         except EOFError:
-            raise InputError("viewer", f"cannot be served at port {port}", "choose another one") from None
+            raise InputError("viewer", f"cannot be served on port {port}", "choose another port") from None
         self._sender = ThreadPoolExecutor(1, "viewer")
 
     def add(self, step: Step, f1: float | None = None) -> None:
@@ -402,7 +400,7 @@ def _log_failure(drawn: Future[None]) -> None:
     """Log an error of the drawing thread; the page keeps showing the step before."""
     error = None if drawn.cancelled() else drawn.exception()
     if error is not None:
-        logging.getLogger(__name__).error("a view could not be drawn", exc_info=error)
+        logging.getLogger(__name__).error("the viewer failed to draw a view", exc_info=error)
 
 
 def _serve(title: str, host: str, port: int, token: str) -> Any:
@@ -421,7 +419,7 @@ def _serve(title: str, host: str, port: int, token: str) -> Any:
     def guarded(*given: Any, process_request: Any, **options: Any) -> Any:
         def answer(connection: Any, request: Any) -> Any:
             if not _is_allowed(request, host, token):
-                return connection.respond(403, "open the whole address that caryatid printed\n")
+                return connection.respond(403, "open the full address that caryatid printed\n")
             request.path = request.path.removeprefix(f"/{token}")
             return process_request(connection, request)
 

@@ -70,7 +70,7 @@ def _cell_of(shown: object) -> Section:
         case SupportGraph():
             return _graph_cell("SupportGraph", census(shown), shown)
         case SceneObject():
-            residual = f"{1e3 * shown.residual:.1f} mm{', a poor fit' * shown.poor_fit}"
+            residual = f"{1e3 * shown.residual:.1f} mm{', poor fit' * shown.poor_fit}"
             views = f"{shown.occurrences} of {shown.opportunities} views"
             facts = [*_size(shown.shape), ("found in", views), ("residual", residual)]
             facts += [(name, said) for name, said in (("why", shown.why), ("doubtful", shown.doubt)) if said]
@@ -90,7 +90,7 @@ def _cell_of(shown: object) -> Section:
             facts += [(name, f"{score:.3f}") for name, score in scores.items()]
             return Section("Decision", shown.why, facts=facts, tables=[point_table(shown)])
         case Order():
-            lead = f"{count_of(len(shown.steps), 'object')} to take, {'safe' if shown.safe else 'not safe'}"
+            lead = f"{count_of(len(shown.steps), 'object')} to remove, {'safe' if shown.safe else 'not safe'}"
             facts = [("refused", shown.refusal)] * bool(shown.refusal)
             return Section("Order", lead, facts=facts, tables=[order_table(shown)])
     raise TypeError(f"a {type(shown).__name__} cannot be shown in a notebook")
@@ -129,7 +129,7 @@ def _view_cell(view: View) -> Section:
 
 def _cloud(cloud: Cloud, graph: SupportGraph, T_world_camera: Array | None) -> Figure:
     picture = draw_cloud(cloud, graph, sensor_azimuth(cloud, T_world_camera))
-    return Figure("", picture, f"the points{', with the shapes fitted to them' * bool(graph.objects)}")
+    return Figure("", picture, f"points{', with the fitted shapes' * bool(graph.objects)}")
 
 
 def _image(view: View, labels: NDArray[np.int32], graph: SupportGraph, caption: str) -> Figure:
@@ -139,7 +139,7 @@ def _image(view: View, labels: NDArray[np.int32], graph: SupportGraph, caption: 
 def _pose(T_world_camera: Array | None) -> str:
     """Where a camera is and how far it looks down, from its pose (4, 4), in words."""
     if T_world_camera is None:
-        return "pose not known"
+        return "unknown pose"
     x, y, z = T_world_camera[:3, 3]
     down = np.degrees(np.arcsin(np.clip(-T_world_camera[2, 2], -1.0, 1.0)))
     return f"at {x:.2f}, {y:.2f}, {z:.2f} m, looking {down:.0f}° down".replace("-", "−")

@@ -1,4 +1,4 @@
-"""The report of a run, section by section, as one HTML file that opens anywhere."""
+"""The report of a run, as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ if TYPE_CHECKING:
 
 
 SUPPORTS = (
-    "Arrows run from supporter to supported, with the probability of the support: the higher it is, the "
-    "thicker the arrow. Dashed: uncertain; an object with a dashed rim has no known supporter."
+    "Arrows run from supporter to supported, labelled with the probability of the support; thicker is more "
+    "probable. Dashed arrows are uncertain; an object with a dashed outline has no known supporter."
 )
 """Caption of a support graph."""
 WIDE = 680.0
 """Width from which a graph cannot be read in half the page [px]: more than eight vertices side by side."""
 MOST = 6
-"""Doubts that are listed; more would bury them [1]."""
+"""Maximum number of listed doubts [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -61,10 +61,10 @@ class Figure:
     Attributes:
         heading: Its heading, or empty.
         picture: What is drawn.
-        caption: What is to be seen in it, or empty.
-        share: One divided by this is its share of the page's width.
-        link: Anchor of the section it leads to, or empty.
-        page: An HTML page that stands in the picture's place where pages can be shown, or empty.
+        caption: Caption, or empty.
+        share: Divisor of the page width: 2 = half of it.
+        link: Anchor of the section it links to, or empty.
+        page: An HTML page that replaces the picture in HTML, or empty.
     """
 
     heading: str
@@ -77,16 +77,16 @@ class Figure:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Section:
-    """A part of the report, on the page as in print, or all a notebook shows of one thing.
+    """A section of the report in HTML and PDF, or a notebook cell.
 
     Attributes:
-        title: Its heading.
-        text: What stands below or beside it.
-        figures: Pictures, as many side by side as there is room for.
+        title: Heading.
+        text: Text below or beside the heading.
+        figures: Pictures, side by side if they fit.
         facts: Names and texts.
         tables: Tables, one below the other.
         colour: Colour of the chip before the title, `#rrggbb`, or empty.
-        folded: On the page, only the title shows until it is clicked.
+        folded: Whether the page shows only the title until it is clicked.
     """
 
     title: str
@@ -108,10 +108,9 @@ class Report:
     """The contents of a report.
 
     Attributes:
-        title: Its heading.
-        about: Under which conditions, when and by what it was made.
-        sections: The answer, what is uncertain, how it went, what was taken apart, and folded: tables, the
-            views, settings.
+        title: Heading.
+        about: Conditions, version and date of the run.
+        sections: Answer, what is uncertain, how it went, removal, and folded: tables, views, settings.
     """
 
     title: str
@@ -129,19 +128,19 @@ def make_report(
     strip: Sequence[Figure] = (),
     config: ReportConfig | None = None,
 ) -> Report:
-    """Describe a run; each step is drawn as it comes, and the images and clouds of one at a time are kept.
+    """Make the report of a run; steps are drawn one by one, to keep only one image and cloud in memory.
 
     Args:
         title: Heading of the report.
-        steps: What `explore` yields, or `extract` takes from a recording or a cloud; at least one.
-        about: Under which conditions, when and by what the run was made.
+        steps: Steps that `explore` or `extract` yields; at least one.
+        about: Conditions, version and date of the run.
         settings: Names and values of the run's settings.
-        scores: What a `Score` says after each view by name; empty where there is no ground truth.
-        strip: Pictures of the objects being taken away, in order.
+        scores: Values of the `Score` after each view by name; empty without ground truth.
+        strip: Pictures of the lifts, in order.
         config: Sizes of the pictures.
 
     Raises:
-        ValueError: There are scores, but not one for each step, or there is no step.
+        ValueError: The number of scores differs from that of the steps, or there are no steps.
     """
     width = (config or ReportConfig()).image_width
     seen: list[Step] = []
@@ -175,8 +174,8 @@ def make_report(
     if pictures or facts:
         sections.append(Section("How it went", figures=pictures, facts=facts))
     if strip:
-        text = "Each object lifted straight up in physics, one after the other."
-        sections.append(Section("Taken apart", text, strip))
+        text = "Each object is lifted straight up in simulation, one after the other."
+        sections.append(Section("Removal", text, strip))
     tables = [object_table(last.graph), support_table(last.graph)]
     sections += [Section("Objects and supports", tables=tables, folded=True), *views]
     named = ((name, str(value)) for name, value in (settings or {}).items())
@@ -209,33 +208,33 @@ def _answer(
         errors = {
             "wrong supports": [f"{a} → {b}" for a, b in truth["wrong"]],
             "missing supports": [f"{a} → {b}" for a, b in truth["missing"]],
-            "objects that are not there": [o.id for o in graph.objects if o.id not in truth["matches"]],
-            "objects not found": truth["unfound"],
+            "wrong objects": [o.id for o in graph.objects if o.id not in truth["matches"]],
+            "missing objects": truth["unfound"],
         }
         listed = "; ".join(f"{name}: {', '.join(names)}" for name, names in errors.items() if names)
-        facts.append(("Against the ground truth", sentence(listed or "nothing is wrong or missing")))
+        facts.append(("Compared with the ground truth", sentence(listed or "nothing is wrong or missing")))
     picture, caption = draw_graph(graph, truth.get("wrong", ()), truth.get("missing", ())), SUPPORTS
     if truth.get("wrong") or truth.get("missing"):
-        caption += " Red: wrong or missing against the ground truth."
+        caption += " Red: wrong or missing, compared with the ground truth."
     wide = picture.width > WIDE
-    supports = Figure("What supports what", picture, caption, share=1 if wide else 2)
+    supports = Figure("Support graph", picture, caption, share=1 if wide else 2)
     azimuth = _first_azimuth(step)
     solid = draw_cloud(step.cloud, graph, azimuth)
-    seen = Figure("The fused cloud", solid, "Every point so far, with the fitted shapes.")
+    seen = Figure("Fused cloud", solid, "All points, with the fitted shapes.")
     if shown.view is not None:
-        caption = f"View {shown.index + 1} with the final shapes; pale names: not visible here."
+        caption = f"View {shown.index + 1} with the final shapes; objects with pale names are not visible."
         seen = Figure("The objects", draw_image(shown.view, shown.labels, graph, width), caption)
     figures = [supports, seen] if wide else [seen, supports]
     if graph.objects:
-        caption = "Drag to turn, scroll to zoom. Arrows show through the objects; orange: uncertain."
+        caption = "Drag to rotate, scroll to zoom. Arrows are visible through objects; orange: uncertain."
         page = scene_3d_html(graph, azimuth)
         figures.append(Figure("In 3D" if wide else "", solid, caption, share=2 if wide else 1, page=page))
     yield Section("Answer", text, figures if wide else figures[:2], facts)
     doubtful = doubts(graph)
     text = (
-        "" if doubtful else "Nothing: every support has a probability of 0.95 or more, and every shape fits."
+        "" if doubtful else "Nothing: all supports have a probability of at least 0.95, and all shapes fit."
     )
-    more = [("And", f"{len(doubtful) - MOST} more; see the tables.")] if len(doubtful) > MOST else []
+    more = [("More", f"{len(doubtful) - MOST} others; see the tables.")] if len(doubtful) > MOST else []
     yield Section("What is uncertain", text, facts=doubtful[:MOST] + more)
     if figures[2:] and not wide:
         yield Section("In 3D", figures=figures[2:])
@@ -258,10 +257,10 @@ def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> lis
     figures = [Figure("", chart, share=3) for chart in charts]
     if any(step.robot is not None for step in steps):
         caption = (
-            "From above, y up: where the platform, or an arm's base, stood for each view, where the camera "
-            "looked, and the platform's way in between."
+            "Seen from above, y up: platform (or arm base) and camera direction at each view, and the "
+            "platform's path."
         )
-        figures.append(Figure("Where the robot stood", draw_stands(steps), caption, 3))
+        figures.append(Figure("Robot poses", draw_stands(steps), caption, 3))
     return figures
 
 
@@ -291,21 +290,20 @@ def _figures(step: Step, width: int) -> list[Figure]:
     if view is not None:
         kind = "colour image" if view.rgb is not None else "depth image, near bright and far dark"
         caption = (
-            f"The {kind} around the objects, tinted by its segments, with the outlines of the shapes fitted "
-            "so far. Outlines are thin where something nearer hides them; an object with a pale name has no "
-            "pixel here."
+            f"The {kind} around the objects, tinted by segment, with the outlines of the fitted shapes. "
+            "Hidden outlines are thin; objects with pale names are not visible."
         )
         picture = draw_image(view, step.labels, graph, width)
-        figures.append(Figure("What the camera saw", picture, caption))
+        figures.append(Figure("Camera image", picture, caption))
     picture = draw_graph(graph)
-    figures.append(Figure("What supports what", picture, SUPPORTS, share=1 if picture.width > WIDE else 2))
+    figures.append(Figure("Support graph", picture, SUPPORTS, share=1 if picture.width > WIDE else 2))
     caption = (
-        f"{len(cloud):,} points fused so far in their objects' colours, with the fitted shapes. Pale: the "
-        "inside of a surface whose other side has not been seen."
+        f"{len(cloud):,} fused points, coloured by object, with the fitted shapes. Pale: the inside of a "
+        "surface whose outside is unseen."
     )
-    figures.append(Figure("The fused cloud", draw_cloud(cloud, graph, _first_azimuth(step)), caption))
+    figures.append(Figure("Fused cloud", draw_cloud(cloud, graph, _first_azimuth(step)), caption))
     if step.candidates is not None or step.decision is not None:
-        figures.append(Figure("Where to look next", draw_sphere(step), _sphere_caption(step)))
+        figures.append(Figure("Next best view", draw_sphere(step), _sphere_caption(step)))
     return figures
 
 
@@ -321,12 +319,12 @@ def sensor_azimuth(cloud: Cloud, T_world_camera: Array | None) -> float:
 
 def _sphere_caption(step: Step) -> str:
     text = (
-        "The view sphere from above, coloured by saliency; pale where the robot cannot bring its camera. "
-        "Rays lead from points of interest to where they are best seen. Numbers: the views so far."
+        "The view sphere from above, coloured by saliency; pale views are out of the robot's reach. Rays "
+        "lead from points of interest to the views that show them best. Numbers: views so far."
     )
     if step.candidates is not None:
         refused = ", ".join(f"{count:,} {reason}" for reason, count in step.candidates.rejected.items())
-        text += f" {len(step.candidates):,} views can be reached{f'; refused: {refused}' if refused else ''}."
+        text += f" {len(step.candidates):,} views are reachable{f'; rejected: {refused}' if refused else ''}."
     return text
 
 
@@ -336,13 +334,13 @@ def _sphere_caption(step: Step) -> str:
 def draw_lift(
     scene: SimulatedScene, taken: Taken, graph: SupportGraph, T_world_camera: Array, config: Config
 ) -> Figure:
-    """Draw a lift as it looked half way up, or at its end where it did harm, in the objects' colours.
+    """Draw a lift half way up, or at its end if it disturbed an object, in the objects' colours.
 
     Args:
-        scene: The scene in physics.
-        taken: The step, done; a body was lifted.
-        graph: What was known.
-        T_world_camera: Where it is seen from (4, 4).
+        scene: The simulated scene.
+        taken: Outcome of the step; a body was lifted.
+        graph: The graph before the lift.
+        T_world_camera: Camera pose (4, 4) of the picture.
         config: Sizes of the picture.
     """
     names, K = list(scene.object_bodies.values()), intrinsics(config.sensor)
@@ -367,7 +365,7 @@ def lift_picture(figure: Figure) -> bytes:
 
 
 def read_lifts(folder: Path) -> list[Figure]:
-    """Read back what `lift_picture` gave; none where there are none."""
+    """Read the pictures that `lift_picture` made, if any."""
     figures = []
     for path in sorted((folder / "lifts").glob("*.png")):
         with Image.open(path) as image:
@@ -395,7 +393,7 @@ def template(name: str) -> jinja2.Template:
 
 
 def render_html(report: Report) -> str:
-    """Write a report as one HTML file that loads nothing from anywhere."""
+    """Write a report as one self-contained HTML file."""
 
     def svg(section: Section, number: int, picture: Picture) -> str:
         """A picture whose name, and so whose ids, no other picture of the page has."""

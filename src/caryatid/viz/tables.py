@@ -1,4 +1,4 @@
-"""Tables of objects, supports, points of interest and orders; and in words, what a view changed."""
+"""Tables of objects, supports, points of interest and orders; and a text of what a view changed."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _object_row(item: SceneObject, graph: SupportGraph) -> dict[str, str | Entry
         "residual [mm]": Entry(
             f"{item.residual * 1e3:.1f}{' poor fit' * item.poor_fit}", doubt=item.poor_fit
         ),
-        "supported by": "–" if surface else supporters or "nothing known",
+        "supported by": "–" if surface else supporters or "unknown",
         "stability": Entry(verdict, doubt=stability is not None and not stability.stable),
         "r_s": ratio,
         "overhang [mm]": overhang,
@@ -98,7 +98,7 @@ def point_table(decision: Decision | None) -> Table:
         (" – ".join(p.subject) or "–", Entry(f"{p.saliency:.2f}", saliency_colour(p.saliency)), p.why)
         for p in points
     )
-    return Table.of("Points of interest", ("about", "saliency", "why"), rows)
+    return Table.of("Points of interest", ("objects", "saliency", "reason"), rows)
 
 
 def order_table(order: Order) -> Table:
@@ -113,11 +113,11 @@ def order_table(order: Order) -> Table:
         )
         for number, step in enumerate(order.steps, 1)
     )
-    return Table.of("Steps", ("", "take", "hold", "nothing else moves", "why"), rows)
+    return Table.of("Steps", ("", "remove", "hold", "P(no other moves)", "reason"), rows)
 
 
 def size_of(shape: Shape) -> str:
-    """Return the size of a shape in words [mm]."""
+    """Return the size of a shape as text [mm]."""
     match shape:
         case Cylinder():
             return f"⌀ {2e3 * shape.radius:.0f} × {1e3 * shape.height:.0f}"
@@ -145,7 +145,7 @@ def uncertain_supports(graph: SupportGraph) -> int:
 
 
 def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
-    """List doubtful supports and objects with the reason and what would settle it, the least known first.
+    """List uncertain supports and objects with the reason and a view that would help, most uncertain first.
 
     A support is doubtful if its probability is below 0.95; an object if it has no known supporter, or its
     shape fits poorly or is implausible.
@@ -156,17 +156,17 @@ def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
             lead = f"{s.supporter} → {s.supported}, probability {s.belief:.2f}"
             found.append((lead, f"{s.why}. {_settled_by(graph, s.supporter, s.supported)}"))
     for item in graph.objects:
-        poor = f"the shape is {1e3 * item.residual:.1f} mm off its points on average"
+        poor = f"the points are {1e3 * item.residual:.1f} mm off the shape on average"
         known = item.role == "support_surface" or graph.supporters(item.id)
         reasons = [poor] * item.poor_fit + [item.doubt] * bool(item.doubt)
-        reasons += ["nothing is known to support it"] * (not known)
+        reasons += ["its supporter is unknown"] * (not known)
         if reasons:
             found.append((item.id, f"{'; '.join(reasons)}. {_settled_by(graph, item.id)}"))
     return found
 
 
 def _settled_by(graph: SupportGraph, *ids: str) -> str:
-    """From where to see the sides of objects that no view has seen."""
+    """Where to look to see the unseen sides of objects."""
     views = []
     for item in (graph[name] for name in ids):
         if item.role == "support_surface" or not any(item.seen):
@@ -181,8 +181,8 @@ def _settled_by(graph: SupportGraph, *ids: str) -> str:
         if places:
             views.append(f"{item.id} from {' and '.join(places)}")
     if views:
-        return f"To settle it, look at {'; '.join(views)}: no view has seen that side."
-    return "Every side in reach of a camera has been seen; what is left is noise, or hidden in between."
+        return f"Look at {'; '.join(views)}: no view shows that side."
+    return "All visible sides were seen; the rest is noise, or hidden between objects."
 
 
 def sentence(text: str) -> str:
@@ -191,7 +191,7 @@ def sentence(text: str) -> str:
 
 
 def changes(before: SupportGraph | None, after: SupportGraph) -> list[str]:
-    """List what a view changed: a line each for objects found, shaped or supported differently, and gone."""
+    """List the changes of a view: one line each for objects found, changed, and gone."""
     known, now = {} if before is None else _supported(before), _supported(after)
     lines = {
         "found": [f"{name} {text}" for name, text in now.items() if name not in known],
@@ -212,5 +212,5 @@ def _supported(graph: SupportGraph) -> dict[str, str]:
             for s in supporters
         ]
         if item.role == "object":
-            texts[item.id] = f"({item.shape.kind}) held by {' and '.join(names) or 'nothing seen yet'}"
+            texts[item.id] = f"({item.shape.kind}) supported by {' and '.join(names) or 'something unseen'}"
     return texts
