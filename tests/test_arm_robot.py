@@ -156,7 +156,7 @@ class TestSolve:
         [(within_arms_length, (2.0, 0.0, 1.5), 2.61), (sideways_only, (-0.3, 0.0, 1.2), 0.49)],
     )
     def test_it_says_why_not(self, reachable, eye, distance):
-        says = f"cannot go to this view: the hand does not reach there, {distance} m from the base"
+        says = f"cannot reach this view: out of the hand's reach, {distance} m from the base"
         with pytest.raises(PlanningError, match=says):
             arm(reachable).move_to(transforms.look_at(eye, TOP))
 
@@ -193,7 +193,7 @@ class TestExploring:
         step = next(explore(stage.camera, stage.robot, config=self.SETTINGS))
         low, out = (step.candidates.rejected[reason] for reason in (REASONS[0], REASONS[2]))
         assert low + out == CONFIG.sphere_points
-        assert step.stop == f"no view is left to go to: {REASONS[0]} ({low}), {REASONS[2]} ({out})"
+        assert step.stop == f"no candidate views left: {REASONS[0]} ({low}), {REASONS[2]} ({out})"
 
     def test_an_arm_that_confirms_nothing_stops(self, stage):
         asked = []

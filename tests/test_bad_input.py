@@ -90,13 +90,13 @@ FEW = np.where((np.indices((120, 160)) // 4 == 10).all(axis=0), 1.0, 0.0)
 @pytest.mark.parametrize(
     ("depth", "T_world_camera", "posed", "loose"),
     [
-        (np.zeros((120, 160)), DOWN, "no pixel has a depth reading; leave", "no pixel has a depth reading"),
-        (np.ones((120, 160)), AHEAD, "100% of them, leans by 90°; show the table top or", 1),
+        (np.zeros((120, 160)), DOWN, "no pixel has a depth reading; remove", "no pixel has a depth reading"),
+        (np.ones((120, 160)), AHEAD, "100% of them, is tilted by 90°; show the table top or", 1),
         (np.full((120, 160), 5.0), AHEAD, "readings are at 5 m, none within 0.1–3 m; check", "at 5 m, none"),
         (NOISE, DOWN, "points lie on one level plane; show", "points lie on one plane; show the table top"),
-        (FEW, DOWN, "only 16 points are on a surface, 200 are needed", "or give a larger image"),
-        (np.ones((200, 1)), DOWN, "side by side are too few", "give a larger image, or one with less noise"),
-        (a_plane(12, 12, DOWN), DOWN, "200 are needed; show more", "or give a larger image"),
+        (FEW, DOWN, "only 16 points are on a surface, fewer than 200", "or give a larger image"),
+        (np.ones((200, 1)), DOWN, "pixels are too few", "give a larger or less noisy image"),
+        (a_plane(12, 12, DOWN), DOWN, "fewer than 200; show more", "or give a larger image"),
         (a_plane(80, 60, DOWN), DOWN, 1, 1),
         (a_plane(160, 120, DOWN), DOWN, 1, 1),
     ],
@@ -138,7 +138,7 @@ def test_an_object_without_readings_on_the_grid_of_samples(tmp_path, capsys):
     assert "no depth in 1 region" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("width", "says"), [(12000, "has more than 89478485"), (9000, "has 9000×9000")])
+@pytest.mark.parametrize(("width", "says"), [(12000, "has more than 89478485"), (9000, "9000×9000")])
 def test_an_image_larger_than_any_cameras(recording, refused, width, says):
     """Its header says so; nothing is decoded."""
     path = recording / "depth/000001.png"
@@ -173,9 +173,9 @@ WEIGHT = '<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
     [
         ('name="table"', 'name="desk"', "has no body 'table'"),
         ("<freejoint/>", "", "has no objects"),
-        ("</mujoco>", "", "is not an MJCF file"),
-        (TWO_ON_A_TABLE, "a table with two cups", "is not an MJCF file"),
-        ('size="0.035 0.05"', 'size="-1 0.05"', "MuJoCo refuses it"),
+        ("</mujoco>", "", "not an MJCF file"),
+        (TWO_ON_A_TABLE, "a table with two cups", "not an MJCF file"),
+        ('size="0.035 0.05"', 'size="-1 0.05"', "MuJoCo rejects it"),
         ('size="0.4 0.5 0.35"/>', 'size="0.4 0.5 0.35"/><freejoint/>', "'table' can move"),
         ('type="cylinder" size="0.035 0.05"', 'type="mesh" mesh="lost"', "lost"),
         ('<geom type="box" size="0.4 0.5 0.35"/>', "", "body 'table' has no geom"),
@@ -217,7 +217,7 @@ def test_clouds_that_do_not_do(points, write_pcd, refused):
     [
         ("explore", "nowhere", "hidden_stack, shelf"),
         ("explore", "no where/scene.xml", "no such file or scene"),
-        ("extract", "nowhere", "there is no such file"),
+        ("extract", "nowhere", "no such file"),
         ("extract", "nowhere.pcd", "missing"),
     ],
 )
@@ -226,7 +226,7 @@ def test_a_source_that_does_not_exist(tmp_path, refused, command, name, says):
 
 
 def test_a_name_of_two_lines_is_said_in_one(tmp_path, refused):
-    refused("extract", tmp_path / "one\ntwo", names="one two", says="there is no such file")
+    refused("extract", tmp_path / "one\ntwo", names="one two", says="no such file")
 
 
 def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
@@ -238,11 +238,11 @@ def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
     (strange / "gt.json").write_text('{"vertices": ["table", "ghost"], "edges": []}')
     for scored, truth, says in (
         (tmp_path / "nowhere", scene_file.parent, "not a directory"),
-        (run, tmp_path / "nowhere", "there is no such scene or recording"),
+        (run, tmp_path / "nowhere", "no such scene or recording"),
         (recording, scene_file.parent, "run.json: the file is missing"),
         (run, recording, "gt.json: the file is missing"),
         (run, strange, "gt.json names 'ghost', which is not a body of the scene"),
-        (run, tmp_path, "is neither a scene nor a recording"),
+        (run, tmp_path, "neither a scene nor a recording"),
         (broken, scene_file.parent, str(broken / "views/01/graph.json")),
     ):
         capsys.readouterr()

@@ -136,7 +136,7 @@ def test_too_few_points_are_a_failure_that_says_so(count):
     points, normals = surface_points(SHAPES[0], np.random.default_rng(0))
     result = fit(points[:count], normals[:count], config=CONFIG, rng=np.random.default_rng(0))
     assert isinstance(result, FitFailure)
-    assert result.reason == f"{count} points are fewer than the {CONFIG.min_points} a shape needs"
+    assert result.reason == f"{count} points are too few, a shape needs {CONFIG.min_points}"
     points[count:] = np.nan
     assert fit(points, normals, config=CONFIG, rng=np.random.default_rng(0)) == result
 

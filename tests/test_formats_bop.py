@@ -105,7 +105,11 @@ def test_an_image_that_is_missing_or_truncated_is_refused(folder, name):
 @pytest.mark.parametrize(
     ("name", "image", "said"),
     [
-        ("mask_visib/000001_000001.png", Image.new("L", (63, 48)), "63×48 pixels, the depth image is 64"),
+        (
+            "mask_visib/000001_000001.png",
+            Image.new("L", (63, 48)),
+            "63×48 pixels, but the depth image has 64",
+        ),
         ("mask_visib/000001_000001.png", Image.new("L", (64, 48), 255), "overlaps the mask of obj_id 7 in"),
         ("depth/000002.png", Image.new("L", (64, 48), 1), "mode L, not a 16-bit grey PNG"),
         ("depth/000002.png", Image.new("I;16", (64, 48)), "the frame is empty"),

@@ -112,7 +112,7 @@ def change(document, *path_and_value):
         (("format", "other"), "caryatid/graph"),
         (("version", 2), "'version' is 2: must be 1"),
         (("objects", ...), "'objects' is missing"),
-        (("objects", 1, "id", "o0"), "two objects are called 'o0'"),
+        (("objects", 1, "id", "o0"), "two objects have the id 'o0'"),
         (("objects", 1, "role", "hero"), "hero"),
         (("objects", 1, "role", "support_surface"), "two support surfaces"),
         (("objects", 1, "label", 70000), "70000"),
@@ -127,7 +127,7 @@ def change(document, *path_and_value):
         (("supports", 0, "kind", "glue"), "glue"),
         (("supports", 0, "contact", [1, 2]), "3 finite numbers"),
         (("stability", {"o99": {}}), "o99"),
-        (("supports", [SUPPORT, SUPPORT]), "the edge o0 → o1 is there twice"),
+        (("supports", [SUPPORT, SUPPORT]), "duplicate edge o0 → o1"),
         (("supports", 0, "supporter", "o1"), "'o1' supports itself"),
     ],
 )

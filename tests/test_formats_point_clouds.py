@@ -139,9 +139,9 @@ def test_odd_but_honest_ascii_is_read(tmp_path):
 def test_a_number_of_points_that_is_not_there_is_refused(tmp_path, encoding):
     for points in (59, 61, 4_000_000_000):
         path = write(tmp_path / "a.pcd", plane(), encoding, POINTS=points, WIDTH=points)
-        refused(path, "is broken, or its header is wrong")
+        refused(path, "broken file or header")
     path.write_bytes(write(path, plane(), encoding).read_bytes()[:-50])
-    refused(path, "is broken, or its header is wrong")
+    refused(path, "broken file or header")
 
 
 GIGABYTES = struct.pack("<II", 100, 10**8 * DTYPE.itemsize) + bytes(100)
@@ -152,12 +152,12 @@ GIGABYTES = struct.pack("<II", 100, 10**8 * DTYPE.itemsize) + bytes(100)
     [
         (None, {"WIDTH": 30}, "WIDTH 30 × HEIGHT 1, POINTS 60"),
         (None, {"FIELDS": "x y z rgba"}, "do not agree"),
-        (None, {"FIELDS": "a b c d e"}, "no fields x y z"),
-        (None, {"TYPE": "U F F U U"}, "floating point"),
+        (None, {"FIELDS": "a b c d e"}, "fields x y z"),
+        (None, {"TYPE": "U F F U U"}, "floating-point"),
         (None, {"POINTS": 0, "WIDTH": 0}, "POINTS 0"),
         (None, {"VIEWPOINT": "0 0 0"}, "VIEWPOINT"),
         (None, {"DATA": None}, "no DATA line"),
-        (GIGABYTES, {"DATA": "binary_compressed", "POINTS": 10**8, "WIDTH": 10**8}, "header is wrong"),
+        (GIGABYTES, {"DATA": "binary_compressed", "POINTS": 10**8, "WIDTH": 10**8}, "broken file or header"),
         (b"1 2 3 4 5\n1 2\n", {"DATA": "ascii", "POINTS": 2, "WIDTH": 2}, "2 were found"),
         (b"1 2 3 4 5\na b c 1 2\n", {"DATA": "ascii", "POINTS": 2, "WIDTH": 2}, "'a'"),
     ],

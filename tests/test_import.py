@@ -92,7 +92,7 @@ def test_without_a_world_a_single_frame_without_a_pose_is_taken(tmp_path, views,
     assert len(recording) == 1
     assert not recording.has_poses
     told = capsys.readouterr().err
-    assert "no --tf FRAME: poses are unknown, so a single frame is taken" in told
+    assert "no --tf FRAME: poses are unknown, so only one frame is imported" in told
     options = ("--out", tmp_path / "run", "--quiet", "--no-report")
     assert run_command("extract", tmp_path / "out", *options) == 0
 
@@ -179,7 +179,7 @@ def test_colour(tmp_path, views, pack, encoding):
 
 def test_a_lens_that_distorts_is_told_of(tmp_path, views, capsys):
     imported(tmp_path, plain_bag(tmp_path, views[:1], D=(0.1, 0.0, 0.0, 0.0, 0.0)), *TOPICS)
-    assert "the lens distorts" in capsys.readouterr().err
+    assert "the lens has distortion" in capsys.readouterr().err
 
 
 # What is left out is counted
@@ -199,7 +199,7 @@ def summary(tmp_path, capsys, source, *options):
 def test_frames_without_a_pose_or_colour_are_counted(tmp_path, views, capsys):
     bag = bag_of(tmp_path, [*views, views[0]], without_pose=(1,), without_colour=(3,))
     document = summary(tmp_path, capsys, bag, *ALL)
-    assert document["skipped"] == {"no colour image of that time": 1, "no pose": 1}
+    assert document["skipped"] == {"no colour image at that time": 1, "no pose": 1}
     assert [view["frame"] for view in document["views"]] == [0, 2]
     assert document["views"][1]["time"] == START + 2 * SECOND
 
@@ -235,16 +235,16 @@ def test_a_broken_image_is_left_out(tmp_path, views, capsys):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ((), "--depth TOPIC is needed; topics with images: /camera/depth/image, /camera/rgb/image; other"),
+        ((), "--depth TOPIC is required; topics with images: /camera/depth/image, /camera/rgb/image; other"),
         (("--depth", "/no", "--info", INFO), "'/no' holds nothing, not images; topics with images:"),
         (("--depth", DEPTH, "--info", "/cam"), "not cameras; topics with cameras: /camera/depth/camera_info"),
-        (("--depth", DEPTH), "--info TOPIC is needed; topics with cameras: /camera/depth/camera_info; other"),
+        (("--depth", DEPTH), "--info TOPIC is required; topics with cameras: /camera/depth/camera_info;"),
         (("--depth", "/chatter", "--info", INFO), "'/chatter' holds std_msgs/msg/String, not images"),
         ((*TOPICS, "--rgb", "/tf"), "--rgb: '/tf' holds tf2_msgs/msg/TFMessage, not images"),
         ((*TOPICS, "--tf", "earth"), "unknown frame 'earth'; known frames: base, map, optical"),
-        ((*TOPICS, "--camera", "x.json"), "--camera: is for TUM RGB-D folders"),
+        ((*TOPICS, "--camera", "x.json"), "--camera: applies only to TUM RGB-D folders"),
         ((*TOPICS, "--set", "recording.min_readings=0.999"), "of its 3 depth images is usable: 3 too few"),
-        ((*TOPICS, "--rgb", RGB, "--set", "recording.colour_gap=0.001"), "3 no colour image of that time"),
+        ((*TOPICS, "--rgb", RGB, "--set", "recording.colour_gap=0.001"), "3 no colour image at that time"),
         ((*TOPICS, "--tf", WORLD, "--set", "recording.pose_gap=0.01"), "3 no pose; record poses"),
     ],
 )  # fmt: skip
@@ -267,8 +267,8 @@ def colour_of(columns, frame):
         (colour_of(2, LENS), "is not registered to colour (320×120 pixels, frame 'optical')"),
         (colour_of(1, "other"), "is not registered to colour (160×120 pixels, frame 'other')"),
         ({"K": np.zeros((3, 3))}, "K has focal lengths 0, 0"),
-        ({"size": (320, 240)}, "(320×240 pixels, frame 'optical') are not the depth images (160×120"),
-        ({"frame": "infra"}, "(160×120 pixels, frame 'infra') are not the depth images (160×120"),
+        ({"size": (320, 240)}, "(320×240 pixels, frame 'optical') differ from the depth images (160×120"),
+        ({"frame": "infra"}, "(160×120 pixels, frame 'infra') differ from the depth images (160×120"),
         (depth_of(lambda b, t, d: b.image(t, d, "mono8")), "encoding 'mono8' is not supported"),
         (depth_of(lambda b, t, d: b.compressed(t, jpeg(d), "jpeg")), "its depth is compressed as 'jpeg'"),
         (depth_of(lambda b, t, d: b.compressed(t, b"", "16UC1; compressedDepth rvl")), "compressedDepth rvl"),
@@ -283,7 +283,7 @@ def test_images_and_cameras_that_do_not_fit_or_cannot_be_decoded(tmp_path, views
 
 @EACH_KIND
 def test_an_empty_bag(tmp_path, kind, unfit):
-    unfit(bag_of(tmp_path, [], kind), *TOPICS, says="the bag is empty")
+    unfit(bag_of(tmp_path, [], kind), *TOPICS, says="the bag has no messages")
 
 
 @EACH_KIND
@@ -324,7 +324,7 @@ def test_the_name_of_the_folder_says_which_camera(tmp_path, views, capsys, numbe
     large = replace(view, depth=depth, rgb=rgb, labels=None)
     (read,) = imported(tmp_path, tum_folder(tmp_path, [large], f"rgbd_dataset_freiburg{number}_xyz"))
     assert read.K[0, 0] == fx
-    assert f"camera: as published for freiburg{number}, fx {fx:g}" in capsys.readouterr().err
+    assert f"published camera of freiburg{number}: fx {fx:g}" in capsys.readouterr().err
 
 
 def spoil(name, text):
@@ -334,15 +334,15 @@ def spoil(name, text):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (spoil("depth.txt", ""), "holds no depth image"),
-        (spoil("depth.txt", "noon depth/x.png\n"), "a row does not begin with a time in seconds"),
+        (spoil("depth.txt", ""), "has no depth images"),
+        (spoil("depth.txt", "noon depth/x.png\n"), "a row does not start with a time in seconds"),
         (spoil("depth.txt", "1.0\n"), "'1.0' has 1 columns, not 2"),
-        (spoil("depth.txt", "nan depth/x.png\n"), "a row does not begin with a time in seconds"),
+        (spoil("depth.txt", "nan depth/x.png\n"), "a row does not start with a time in seconds"),
         (spoil("groundtruth.txt", "1.0 0 0 0\n"), "has 4 columns, not 8"),
         (spoil("groundtruth.txt", "1.0 0 0 0 0 0 0 0\n"), "is not a pose"),
         (spoil("groundtruth.txt", "1.0 0 0 0 0 0 0 one\n"), "is not a pose"),
         (spoil("groundtruth.txt", "# none\n"), "none of its 3 depth images is usable: 3 no pose"),
-        (spoil("rgb.txt", "# none\n"), "3 no colour image of that time"),
+        (spoil("rgb.txt", "# none\n"), "3 no colour image at that time"),
         (lambda folder: shutil.rmtree(folder / "depth"), "3 broken"),
         (lambda folder: (folder / "depth.txt").write_bytes(b"\xff\xfe"), "depth.txt: cannot be read"),
     ],
@@ -359,7 +359,7 @@ def test_a_camera_that_is_not_known_or_does_not_fit(tmp_path, views, unfit):
     (tmp_path / "camera.json").write_text('{"fx": 500, "fy": 500, "cx": 320}')
     unfit(folder, "--camera", tmp_path / "camera.json", says="the key 'cy' is missing")
     unfit(tum_folder(tmp_path, views, "freiburg1"), says="its images (640×480 pixels")
-    unfit(folder, *TOPICS, says="are for bags")
+    unfit(folder, *TOPICS, says="apply only to bags")
 
 
 def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views, capsys):
@@ -367,7 +367,7 @@ def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views,
     folder = tum_folder(tmp_path, [replace(view, T_world_camera=T @ view.pose) for view in views])
     options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
     levelled = list(imported(tmp_path, folder, *options))
-    assert "so that the table is level" in capsys.readouterr().err
+    assert "to level the table" in capsys.readouterr().err
     for view, upright in zip(levelled, views, strict=True):
         assert np.rad2deg(transforms.angle_between(view.pose[2, :3], upright.pose[2, :3])) < 0.5
     before, after = (transforms.invert(a.pose) @ b.pose for a, b in (views[:2], levelled[:2]))

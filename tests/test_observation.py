@@ -99,7 +99,7 @@ def test_nothing_is_an_error_that_names_it(pose):
     with pytest.raises(PerceptionError, match="frame 7: has no depth readings"):
         observation_of(View(np.zeros((60, 80)), VIEW.K, pose, name="frame 7"))
     nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3)), name="cloud 7")
-    with pytest.raises(PerceptionError, match="cloud 7: holds no points"):
+    with pytest.raises(PerceptionError, match="cloud 7: has no points"):
         observation_of(nothing)
     rng = np.random.default_rng(0)
     noise = Cloud(rng.normal(size=(500, 3)), transforms.unit(rng.normal(size=(500, 3))), name="noise")

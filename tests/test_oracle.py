@@ -129,5 +129,5 @@ def test_the_command_line_has_it_for_scenes_and_not_for_recordings(tmp_path, sce
     assert "F1 goes from" in (tmp_path / "a/views/00/view.json").read_text()
     capsys.readouterr()
     assert run_command("explore", recording, "--out", tmp_path / "b", *options) == 1
-    assert "'oracle' needs a simulated scene" in capsys.readouterr().err
+    assert "'oracle' requires the ground truth of a simulated scene" in capsys.readouterr().err
     assert not (tmp_path / "b").exists()

@@ -197,7 +197,7 @@ class TestPointsOfInterest:
         outwards = SPHERE.centre_world + (SPHERE.radius, 0.0, 0.0) - self.FLOATING.centre_world
         at_face = self.FLOATING.centre_world + outwards * (0.04 / outwards[0])
         np.testing.assert_allclose(floating.position_world, at_face, atol=1e-9)
-        assert floating.why == "nothing is known to support o3; the largest gap between views is at 0°"
+        assert floating.why == "the supporter of o3 is unknown; the largest gap between views is at 0°"
         doubtful = SupportGraph((TABLE, replace(self.LOWER, doubt="overlaps o2 by 30 mm"), self.UPPER))
         (point,) = points_of_doubt(doubtful, SPHERE, direction(0.0, 0.6)[None])
         assert (point.subject, point.saliency) == (("o1",), 1.0)
@@ -541,7 +541,7 @@ class TestHiddenSurface:
             chosen = OPEN.directions[decision.index]
             assert degrees_between(visited, chosen).min() > 15.0
             assert turn or chosen @ HOME < 0.5
-            assert turn or decision.why == "shows most of what is still hidden: o1 (100%)"
+            assert turn or decision.why == "shows the most hidden surface: o1 (100%)"
             visited = np.vstack([visited, chosen])
 
     def test_it_takes_the_look_that_shows_most_anew_at_little_cost_and_says_what(self, worked_out):
@@ -559,7 +559,7 @@ class TestHiddenSurface:
         assert decision.cost == pytest.approx(cost[best])
         shares = sorted(((gain[best] / total[best], name) for name, gain in worth.items()), reverse=True)
         said = ", ".join(f"{name} ({share:.0%})" for share, name in shares[:3] if share > 0.05)
-        assert decision.why == f"shows most of what is still hidden: {said}"
+        assert decision.why == f"shows the most hidden surface: {said}"
 
     def test_the_middles_of_what_is_hidden_are_points_of_interest(self, worked_out):
         decision, config, gains, relations = worked_out
@@ -579,9 +579,7 @@ class TestHiddenSurface:
         points = decision.points_of_interest[relations:]
         for point, (name, worth, middle, outward) in zip(points, expected, strict=True):
             space = name == SPACE
-            assert point.why == (
-                "unseen space on the table" if space else f"part of {name} has not been seen"
-            )
+            assert point.why == ("unseen space on the table" if space else f"part of {name} is unseen")
             assert point.subject == (() if space else (name,))
             assert point.saliency == pytest.approx(worth / most)
             np.testing.assert_allclose(point.position_world, middle)
@@ -649,7 +647,7 @@ class TestBaselines:
         offered = Candidates(np.tile(np.eye(4), (3, 1, 1)), equal, np.zeros(3), {})
         decision = plan("farthest", [CUBE], visited=np.array([[-1.0, 0.0, 0.0]]), offered=offered)
         assert decision.index == 0
-        assert decision.why == "90° from the nearest earlier view, farther than any other"
+        assert decision.why == "farthest from earlier views: 90° from the nearest"
 
 
 SIZE, OF_FREE, OF_OCCUPIED = 0.01, 0.12, 0.97
@@ -750,7 +748,7 @@ class TestVolumetric:
         share = free.candidate_saliency[new]
         assert free.saliency == share.max() == 1.0
         assert name == "occlusion-aware" or OPEN.directions[free.index][0] > 0.3, "past the screen"
-        said = f"{1.0 / share.mean():.1f} times the views' mean {name} information, 100% of the most"
+        said = f"{1.0 / share.mean():.1f} times the mean {name} information of all views, 100% of the maximum"
         assert free.why == said
         utility = share / share.sum() - np.sin(angle / 2.0) / np.sin(angle / 2.0).sum()
         assert dear.index == new[int(np.argmax(utility))]
@@ -780,9 +778,9 @@ class TestAPlannerOfAnotherPackage:
     """One file and its entry point make a planner."""
 
     def test_it_is_found_by_its_entry_point_and_listed_with_the_others(self, monkeypatch):
-        with pytest.raises(InputError, match=f"no planner 'best'.*{', '.join(BUILT_IN)}, oracle"):
+        with pytest.raises(InputError, match=f"unknown planner 'best'.*{', '.join(BUILT_IN)}, oracle"):
             make_planner("best")
-        with pytest.raises(InputError, match="'oracle' needs a simulated scene"):
+        with pytest.raises(InputError, match="'oracle' requires the ground truth of a simulated scene"):
             make_planner("oracle")
         value = "caryatid.planning.planners.baselines:RandomPlanner"
         offers = [EntryPoint(n, value, "caryatid.planners") for n in ("mine", "support", "oracle")]

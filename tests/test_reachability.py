@@ -77,10 +77,10 @@ class TestReachabilityMap:
 @pytest.mark.parametrize(
     ("forward", "limits", "count", "message"),
     [
-        (gantry, np.zeros((6, 3)), 10, r"\(6, 3\) is not \(J, 2\)"),
+        (gantry, np.zeros((6, 3)), 10, r"\(J, 2\), not shape \(6, 3\)"),
         (gantry, [[0.0, np.nan]], 10, "finite"),
-        (gantry, [[0.0, 1.0], [1.0, 0.5]], 10, "joint 1 begins above its end"),
-        (gantry, LIMITS, 0, "0 postures"),
+        (gantry, [[0.0, 1.0], [1.0, 0.5]], 10, "joint 1 has low > high"),
+        (gantry, LIMITS, 0, "0 is too few"),
         (lambda joints: gantry(joints)[:, :3], LIMITS, 10, r"returned shape \(1, 3, 4\) for 1 postures"),
         (lambda joints: gantry(joints)[:-1], LIMITS, 10, r"returned shape \(0, 4, 4\)"),
         (lambda joints: 2.0 * gantry(joints), LIMITS, 10, "last row"),
@@ -108,14 +108,14 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            ({"format": np.array("caryatid/graph")}, "is not a reachability map"),
-            ({"version": np.array(2)}, "version 2, not 1"),
-            ({"cell": None}, "its arrays"),
-            ({"cell": np.array(np.nan)}, "its arrays"),
-            ({"origin_base": np.zeros(2)}, "its arrays"),
-            ({"reached": np.zeros((2, 2, 2, 2))}, "its arrays"),
-            ({"reached": np.zeros((2, 2, 2), dtype=np.uint8)}, "its arrays"),
-            ({"reached": np.zeros((0, 2, 2, 2), dtype=np.uint8)}, "its arrays"),
+            ({"format": np.array("caryatid/graph")}, "not a reachability map"),
+            ({"version": np.array(2)}, "version 2 is not supported"),
+            ({"cell": None}, "not the arrays"),
+            ({"cell": np.array(np.nan)}, "not the arrays"),
+            ({"origin_base": np.zeros(2)}, "not the arrays"),
+            ({"reached": np.zeros((2, 2, 2, 2))}, "not the arrays"),
+            ({"reached": np.zeros((2, 2, 2), dtype=np.uint8)}, "not the arrays"),
+            ({"reached": np.zeros((0, 2, 2, 2), dtype=np.uint8)}, "not the arrays"),
             ({"reached": np.array([None])}, "pickle"),
         ],
     )

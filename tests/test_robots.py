@@ -111,8 +111,8 @@ class TestHumanoidRobot:
             ((-1.5, 0.0, 1.5), (0.0, 0.0, 2.9), UP, "the head pitch is beyond its limits"),
             ((-1.5, 0.0, 1.5), (0.0, 0.0, 1.0), (0.0, 0.2, 1.0), "rolled"),
             ((-1.5, 0.0, 1.5), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0), "rolled"),
-            ((-0.3, 0.0, 1.5), (0.0, 0.0, 1.4), UP, "in an obstacle"),
-            ((-3.5, 0.0, 1.5), (0.0, 0.0, 1.4), UP, "outside the floor"),
+            ((-0.3, 0.0, 1.5), (0.0, 0.0, 1.4), UP, "hit an obstacle"),
+            ((-3.5, 0.0, 1.5), (0.0, 0.0, 1.4), UP, "off the floor"),
         ],
     )
     def test_it_says_why_not(self, eye, target, up, reason):
@@ -121,7 +121,7 @@ class TestHumanoidRobot:
     def test_no_path_is_a_reason(self):
         shut = floor(TABLE, box((0.62, 0.0, 1.0), (0.03, 3.2, 1.0)))
         blocked, free = (standing(f, pose(180.0, 35.0)).solve(pose(0.0, 30.0)) for f in (shut, floor(WALL)))
-        assert "no path leads there; camera at (1.30" in blocked.reason
+        assert "no free path; camera at (1.30" in blocked.reason
         assert isinstance(free, Posture)
 
     def test_candidates_agree_with_solve(self):
@@ -130,7 +130,7 @@ class TestHumanoidRobot:
         candidates = robot.candidates(SPHERE)
         offered = set(candidates.indices.tolist())
         assert len(candidates) + sum(candidates.rejected.values()) == len(SPHERE.directions)
-        assert candidates.rejected["a wall stands in the line of sight"] > 100
+        assert candidates.rejected["a wall blocks the line of sight"] > 100
         seen = {True: 0, False: 0}
         for i in np.random.default_rng(3).integers(0, 40_000, 300).tolist():
             T = SPHERE.poses(SPHERE.directions[i : i + 1])[0]
@@ -184,7 +184,7 @@ class TestHumanoidRobot:
 
     def test_home_is_the_reachable_view_nearest_to_the_minus_x_side(self):
         robot = HumanoidRobot(floor(TABLE), CONFIG)
-        with pytest.raises(PlanningError, match="no pose yet"):
+        with pytest.raises(PlanningError, match="no camera pose yet"):
             _ = robot.T_world_camera
         wanted = direction(*np.deg2rad((180.0, 35.0)))
         home = home_view(robot, SPHERE, CONFIG)
@@ -195,7 +195,7 @@ class TestHumanoidRobot:
         others = walled.candidates(SPHERE).directions
         assert transforms.angle_between(home, wanted) == transforms.angle_between(others, wanted).min()
         shut = HumanoidRobot(floor(box((0.0, 0.0, 1.0), (3.0, 3.0, 1.0))), CONFIG)
-        with pytest.raises(PlanningError, match=r"in an obstacle \(\d"):
+        with pytest.raises(PlanningError, match=r"hit an obstacle \(\d"):
             home_view(shut, SPHERE, CONFIG)
 
 
@@ -216,7 +216,7 @@ class TestRecordingRobot:
 
     def test_other_poses_are_unreachable_and_it_says_why(self):
         robot = RecordingRobot(self.POSES)
-        for T, why in ((pose(45.0, 35.0), "no view from there"), (self.POSES[0], "already been used")):
+        for T, why in ((pose(45.0, 35.0), "no view at this pose"), (self.POSES[0], "was already used")):
             with pytest.raises(PlanningError, match=why):
                 robot.move_to(T)
 
@@ -291,8 +291,8 @@ class TestCommandLine:
         far = ["--robot", f"arm:{map_file}", "--set=arm.base=[-5.0, 0.0, 0.0]"]
         assert run_command("explore", "tower", "--out", tmp_path / "run", *far, *QUICK) == 1
         said = capsys.readouterr().err
-        assert "no view of the sphere can be reached: " in said
-        assert "the hand does not reach there (" in said
+        assert "no view of the view sphere is reachable: " in said
+        assert "out of the hand's reach (" in said
         assert not (tmp_path / "run").exists()
 
     def test_a_recording_has_no_robot(self, kept_recording, tmp_path, capsys):

@@ -141,7 +141,7 @@ REFUSED = {
     "no K": (lambda v: body(v, camera={"T_world_camera": v.pose.tolist()}), 422, "K: Field required"),
     "mirrored": (lambda v: body(v, camera=camera_of(v, T_world_camera=MIRRORED)), 422, "not a rotation"),
     "endless units": (lambda v: body(v, camera=camera_of(v, depth_scale=np.inf)), 422, "depth_scale"),
-    "no base64": (lambda v: body(v, depth="£"), 422, "depth: is not an image"),
+    "no base64": (lambda v: body(v, depth="£"), 422, "depth: not an image"),
     "half of base64": (lambda v: body(v, depth="abc"), 422, "body.depth"),
     "no labels": (lambda v: body(v, labels=None), 422, "has no labels"),
     "a key too many": (lambda v: body(v, labls="x"), 422, "labls"),

@@ -414,7 +414,7 @@ def given(**images):
 BOMB = png(np.zeros((5000, 5000), np.uint16))
 HUGE = npy(np.zeros((1, 1), np.float32)).replace(b"(1, 1), }        ", b"(50000, 50000), }")
 BROKEN = {
-    "no image": (given(depth=b"hello"), "is not an image"),
+    "no image": (given(depth=b"hello"), "not an image"),
     "8 bit depth": (given(depth=png(np.full((120, 160), 90, np.uint8))), "not a 16-bit grey PNG"),
     "a pickle": (given(depth=npy(np.array([[{}]]), allow_pickle=True)), "not a valid .npy"),
     "whole numbers for metres": (given(depth=npy(np.ones((120, 160), int))), "floats in metres"),

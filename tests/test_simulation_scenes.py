@@ -315,7 +315,7 @@ def test_truth_files_come_back_and_the_kind_may_be_missing(tmp_path: Path):
     ("text", "reason"),
     [
         ('{"vertices": [', "broken JSON"),
-        ("[]", "not an object"),
+        ("[]", "expected a JSON object"),
         (json.dumps({**EASY, "vertices": "table"}), "'vertices'"),
         (json.dumps({**EASY, "vertices": ["table", "a", "a"]}), "twice"),
         (json.dumps({"vertices": ["table"]}), "'edges'"),

@@ -64,8 +64,8 @@ def test_a_view_from_another_pose_is_the_same_view():
         ({"rgb": np.zeros((5, 4, 3), dtype=np.uint8)}, "rgb is 4×5, depth is 5×4"),
         ({"labels": np.zeros((4, 4), dtype=np.int32)}, "labels is 4×4, depth is 5×4"),
         ({"normals_camera": np.zeros((3, 5, 3))}, "normals_camera is 5×3"),
-        ({"labels": np.full((4, 5), -1)}, "labels leave"),
-        ({"labels": np.full((4, 5), SUPPORT_LABEL)}, "labels leave"),
+        ({"labels": np.full((4, 5), -1)}, "labels exceed"),
+        ({"labels": np.full((4, 5), SUPPORT_LABEL)}, "labels exceed"),
     ],
 )
 def test_a_view_that_makes_no_sense_is_refused_by_name_and_reason(fields, reason):

@@ -117,7 +117,7 @@ class OraclePlanner:
         self.camera.taken.clear()
         same_views = self._scene.views == len(state.visited)
         if not same_views or graph_text(self._scene.graph) != graph_text(state.graph):
-            reason = "its views and settings are not those of this exploration"
+            reason = "its views and settings differ from those of this exploration"
             remedy = "pass its camera to explore(), with the same configuration, segmentation and seed"
             raise InputError(f"planner {ORACLE}", reason, remedy)
 

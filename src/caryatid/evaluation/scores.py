@@ -289,8 +289,8 @@ def mask_ious(
     """
     if [a.size for a in labels] != [b.size for b in true_labels]:
         shapes, true_shapes = [a.shape for a in labels], [b.shape for b in true_labels]
-        why = f"the run has label images of {shapes}, the truth of {true_shapes}"
-        raise InputError("labels", why, "give the truth of the frames the run was made from")
+        why = f"the run has label images of {shapes}, but the ground truth of {true_shapes}"
+        raise InputError("labels", why, "give the ground truth of the frames of this run")
     intersection = np.zeros((len(found) + 1, len(true) + 1))
     for image, true_image in zip(labels, true_labels, strict=True):
         row, column = _order(image, found), _order(true_image, true)

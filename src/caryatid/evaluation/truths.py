@@ -33,7 +33,7 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
     labels = {scene.table: 0} | {body: label for label, body in scene.object_bodies.items()}
     if strange := [name for name in truth.vertices if name not in labels]:
         why = f"gt.json names '{strange[0]}', which is not a body of the scene"
-        raise InputError(scene.source, why, f"the bodies are {', '.join(labels)}")
+        raise InputError(scene.source, why, f"known bodies: {', '.join(labels)}")
     shapes = true_shapes(scene)
     objects = {name: shapes[labels[name]] for name in truth.vertices if name != scene.table}
     table = scene.table if scene.table in truth.vertices else None
@@ -72,9 +72,9 @@ def evaluate_run(
             for n, view in enumerate(run.views, 1)
         ]
     else:
-        why = "there is no such scene or recording"
+        why = "no such scene or recording"
         if folder.exists():
-            why = "is neither a scene nor a recording"
+            why = "neither a scene nor a recording"
         remedy = "give a scene (scene.xml), or a recording with scene_camera.json and gt.json"
         raise InputError(source, why, remedy)
     return tuple(scores)

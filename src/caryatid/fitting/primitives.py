@@ -91,7 +91,7 @@ def fit(
             raise InputError(name, reason, "give points (N, 3) [m] and a unit normal (N, 3) for each")
     points, normals = _finite(points, normals)
     if len(points) < config.min_points:
-        return FitFailure(f"{len(points)} points are fewer than the {config.min_points} a shape needs")
+        return FitFailure(f"{len(points)} points are too few, a shape needs {config.min_points}")
     fits, judged_by = _ranked(points, normals, config, rng)
     best, least = None, np.inf
     for f in fits:
@@ -106,7 +106,7 @@ def fit(
         if total < least:
             best, least = priced, total
     if best is None:
-        return FitFailure(f"every shape exceeds the longest extent of {config.max_extent:g} m")
+        return FitFailure(f"every shape exceeds the maximum extent of {config.max_extent:g} m")
     shape, residual, inliers, uncertainty = close_hidden_faces(best.shape, best.seen, points, config)
     poor = residual > config.max_residual
     return replace(best, shape=shape, residual=residual, inliers=inliers, poor=poor, uncertainty=uncertainty)

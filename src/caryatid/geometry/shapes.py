@@ -454,7 +454,7 @@ def from_size(kind: str, T_world_object: Array, size: Any, source: str) -> Shape
         return KINDS[kind].from_size(T, size)
     except (TypeError, ValueError, KeyError):
         known = ", ".join(f"a {name} {one._size_format()}" for name, one in KINDS.items())
-        raise InputError(source, f"no shape '{kind}' with size {size}", f"sizes are: {known}") from None
+        raise InputError(source, f"no shape '{kind}' with size {size}", f"known sizes: {known}") from None
 
 
 def fibonacci_sphere(count: int) -> Array:

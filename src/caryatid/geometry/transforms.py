@@ -35,20 +35,20 @@ def as_rigid(T: ArrayLike, name: str = "transform") -> Array:
     try:
         matrix = np.asarray(T, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError(name, "is not a matrix", "give a homogeneous rigid transform (4, 4)") from None
+        raise InputError(name, "not a matrix", "give a homogeneous rigid transform (4, 4)") from None
     if matrix.shape != (4, 4):
         raise InputError(name, f"shape {matrix.shape} is not (4, 4)", "give a homogeneous rigid transform")
     if not np.isfinite(matrix).all():
-        raise InputError(name, "holds NaN or infinity", "give a finite rigid transform")
+        raise InputError(name, "contains NaN or infinity", "give a finite rigid transform")
     if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=RIGID_TOLERANCE):
         raise InputError(name, "the last row is not 0 0 0 1", "give a homogeneous rigid transform")
     if np.abs(matrix[:3, 3]).max() > FARTHEST:
-        raise InputError(name, f"is over {FARTHEST:g} m from the world's origin", "give it in metres")
+        raise InputError(name, f"more than {FARTHEST:g} m from the world's origin", "give it in metres")
     R = matrix[:3, :3]
     if not np.allclose(R.T @ R, np.eye(3), atol=RIGID_TOLERANCE) or np.linalg.det(R) < 0.0:
         raise InputError(
             name,
-            "its 3×3 part is not a rotation (not orthonormal, or mirrored)",
+            "the 3×3 part is not a rotation (not orthonormal, or mirrored)",
             "check units and row order; p_world = T_world_camera @ p_camera",
         )
     return matrix

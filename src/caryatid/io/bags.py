@@ -63,7 +63,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
             images do not fit each other.
     """
     if options.camera_file is not None:
-        raise InputError("--camera", "is for TUM RGB-D folders", "give a bag's camera with --info TOPIC")
+        raise InputError("--camera", "applies only to TUM RGB-D folders", "for a bag, use --info TOPIC")
     bag = _Bag(path)
     depth_topic = bag.require("--depth", options.depth, "images")
     info_topic = bag.require("--info", options.info, "cameras")
@@ -74,7 +74,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     colours = None if rgb_topic is None else bag.images(rgb_topic, colour)
     pose_at, notes = None, []
     if options.world is None:
-        notes.append("no --tf FRAME: poses are unknown, so a single frame is taken")
+        notes.append("no --tf FRAME: poses are unknown, so only one frame is imported")
     else:
         tree = _read_transforms(bag, config.pose_gap)
         for frame in dict.fromkeys([options.world, *(depth.frame for depth in depths)]):
@@ -83,7 +83,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
                 raise InputError(path, f"unknown frame '{frame}'", known)
         pose_at = partial(tree.between, options.world)
     if distorts:
-        notes.append("the lens distorts, but a pinhole camera is assumed: give rectified topics")
+        notes.append("the lens has distortion, but a pinhole camera is assumed: use rectified topics")
     return make_video(path, depths, colours, cameras, pose_at, config, notes)
 
 
@@ -104,7 +104,7 @@ class _Bag:
         weakref.finalize(self, self._reader.close)
         self._types = {c.topic: c.msgtype for c in self._reader.connections}
         if not self._reader.message_count:
-            raise InputError(path, "the bag is empty: it holds no message", "record it again")
+            raise InputError(path, "the bag has no messages", "record it again")
 
     def topics(self, kind: str) -> list[str]:
         """Topics with messages of a kind of `TYPES`, by name."""
@@ -117,7 +117,7 @@ class _Bag:
             return topic
         reason = f"{option}: '{topic}' holds {self._types.get(topic or '', 'nothing')}, not {kind}"
         if topic is None:
-            reason = f"{option} TOPIC is needed"
+            reason = f"{option} TOPIC is required"
         others = sorted(set(self._types) - set(fitting))
         listed = f"topics with {kind}: {', '.join(fitting) or 'none'}"
         raise InputError(self.path, reason, f"{listed}; other topics: {', '.join(others) or 'none'}")
@@ -168,7 +168,7 @@ def _read_cameras(bag: _Bag, topic: str) -> tuple[list[TimedCamera], bool]:
         cameras.append(TimedCamera(source, time, frame, K, size))
         distorts = distorts or bool(np.any(D))
     if not cameras:
-        raise InputError(bag.path, f"'{topic}' holds no message", "record the camera info too")
+        raise InputError(bag.path, f"'{topic}' has no messages", "record the camera info too")
     return cameras, distorts
 
 
@@ -182,7 +182,7 @@ def _read_transforms(bag: _Bag, max_gap: float) -> TransformTree:
                 parent, child = _frame(item.header.frame_id), _frame(item.child_frame_id)
                 tree.add(parent, child, time, pose, fixed=topic.endswith("tf_static"))
     if not tree.frames:
-        raise InputError(bag.path, "holds no transforms", "record /tf and /tf_static, or leave --tf out")
+        raise InputError(bag.path, "has no transforms", "record /tf and /tf_static, or omit --tf")
     return tree
 
 
@@ -245,7 +245,7 @@ def _pixels(message: Any, kind: str, channels: int, source: str) -> NDArray[Any]
     row = width * channels * dtype.itemsize
     data = np.asarray(message.data, dtype=np.uint8)
     if not height or not width or step < row or data.size < height * step:
-        raise BrokenImageError(source, "an image has less data than its size says", "record it again")
+        raise BrokenImageError(source, "an image has less data than its size requires", "record it again")
     rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
     return rows.view(dtype).reshape(height, width, channels).astype(dtype.newbyteorder("="))
 
@@ -260,5 +260,5 @@ def _damage(path: Path) -> Iterator[None]:
     except Exception as error:
         words = " ".join(str(error).split()) or type(error).__name__
         reason = f"rosbags cannot read it ({words if len(words) <= 120 else words[:119] + '…'})"
-        remedy = "mend it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`, or record it again"
+        remedy = "repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`, or record it again"
         raise InputError(path, reason, remedy) from error

@@ -73,10 +73,10 @@ def read_recording(folder: str | Path, config: RecordingConfig | None = None) ->
             several frames have no poses, or there is no frame. Loading a frame raises it if an image is
             missing, broken, or of another size or mode, or if masks overlap.
     """
-    check_type("folder", folder, (str, Path), "give a scene folder of the BOP format")
+    check_type("folder", folder, (str, Path), "give a scene folder in the BOP format")
     folder = find_sample(folder)
     if not folder.is_dir():
-        raise InputError(folder, "is not a folder", "give a scene folder of the BOP format")
+        raise InputError(folder, "not a directory", "give a scene folder in the BOP format")
     path = folder / "scene_camera.json"
     remedy = "a recording needs it: cam_K and depth_scale of each frame"
     cameras = parse_json(dict[int, _Camera], read_json(path, remedy), path, remedy)
@@ -84,7 +84,7 @@ def read_recording(folder: str | Path, config: RecordingConfig | None = None) ->
         raise InputError(folder, "has no frames: scene_camera.json is empty", "give a recording with frames")
     for image in sorted((folder / "depth").glob("*.png")):
         if image.stem not in {f"{number:06d}" for number in cameras}:
-            remedy = "add its camera there, or take the image out"
+            remedy = "add its camera there, or delete the image"
             raise InputError(image, "has no entry in scene_camera.json", remedy)
     masks, most = _read_masks(folder, set(cameras)), (config or RecordingConfig()).max_pixels
     frames = tuple(
@@ -144,7 +144,7 @@ def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
                 mask = np.where(view.labels == label, np.uint8(255), np.uint8(0))
                 folder.write(f"mask_visib/{index:06d}_{order:06d}.png", images.png(mask))
     if not cameras:
-        raise InputError(folder.folder, "there are no views to write", "give at least one")
+        raise InputError(folder.folder, "no views to write", "give at least one")
     folder.write("scene_camera.json", json_text(cameras).encode())
     if objects:
         folder.write("scene_gt.json", json_text(objects).encode())
@@ -166,7 +166,7 @@ def _frame(
         depth = images.read_depth(depth_path, camera.depth_scale, max_pixels)
         if not depth.any():
             reason = "the frame is empty: no pixel has a depth reading"
-            raise InputError(depth_path, reason, "leave this frame out")
+            raise InputError(depth_path, reason, "remove this frame")
         rgb = None if rgb_path is None else images.decode_image(rgb_path, max_pixels=max_pixels)
         labels = None if masks is None else _read_labels(masks, depth, max_pixels)
         return View(depth, K, T_world_camera, rgb, labels, name=name)
@@ -181,7 +181,7 @@ def _read_labels(masks: Masks, depth: NDArray[np.float32], max_pixels: int) -> N
         mask = images.read_mask(path, max_pixels=max_pixels)
         if mask.shape != depth.shape:
             (height, width), (rows, columns) = mask.shape, depth.shape
-            reason = f"is {width}×{height} pixels, the depth image is {columns}×{rows}"
+            reason = f"has {width}×{height} pixels, but the depth image has {columns}×{rows}"
             raise InputError(path, reason, "register the images to one size")
         taken = labels[mask & (labels > 0)]
         if len(taken):

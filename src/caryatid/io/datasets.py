@@ -26,7 +26,7 @@ BUILT_IN: Final = ("bop", "tum", "bags")
 """Modules of `caryatid.io` that are formats, in the order in which they are tried."""
 ENTRY_POINTS: Final = "caryatid.datasets"
 """Group of the entry points of other packages' formats."""
-NO_COLOUR: Final = "no colour image of that time"
+NO_COLOUR: Final = "no colour image at that time"
 NO_POSE: Final = "no pose"
 """Reasons why a frame of a video does not become a view."""
 
@@ -122,7 +122,7 @@ class Dataset(Sequence[View]):
         for frame in self.frames:
             if frame.name.rpartition("/")[2] == name.rpartition("/")[2]:
                 return frame
-        raise InputError(self.path, f"has no frame '{name}'", "give the recording the run was made from")
+        raise InputError(self.path, f"has no frame '{name}'", "give the recording of this run")
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,11 +166,11 @@ def open_dataset(
     """
     path = find_sample(path)
     if not path.exists():
-        raise InputError(path, "there is no such file or folder", "give a recording")
+        raise InputError(path, "no such file or folder", "give a recording")
     known = format_of(path)
     if known is None:
         bags = "a bag (.bag, .mcap, .db3, or a folder with metadata.yaml)"
         remedy = f"give a BOP scene folder, {bags}, or a TUM RGB-D folder with depth.txt"
-        raise InputError(path, "has an unknown format", remedy)
+        raise InputError(path, "unknown format", remedy)
     dataset: Dataset = known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())
     return dataset

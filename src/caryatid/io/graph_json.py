@@ -156,18 +156,18 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
     ids = [o.id for o in given.objects]
     pairs = [(s.supporter, s.supported) for s in given.supports]
     for twice in {i for i in ids if ids.count(i) > 1}:
-        raise InputError(name, f"two objects are called '{twice}'", "give each its own id")
+        raise InputError(name, f"two objects have the id '{twice}'", "give each object a unique id")
     if sum(o.role == "support_surface" for o in given.objects) > 1:
         raise InputError(name, "has two support surfaces", "keep one; the others are objects")
     for one, other in pairs:
         if one == other:
             raise InputError(name, f"'{one}' supports itself", "remove the edge")
         if pairs.count((one, other)) > 1:
-            raise InputError(name, f"the edge {one} → {other} is there twice", "keep one of them")
+            raise InputError(name, f"duplicate edge {one} → {other}", "keep one of them")
     for known in [*(i for pair in pairs for i in pair), *given.stability]:
         if known not in ids:
-            there = f"the objects are {', '.join(ids) or 'none'}"
-            raise InputError(name, f"no object is called '{known}'", there)
+            there = f"known objects: {', '.join(ids) or 'none'}"
+            raise InputError(name, f"unknown object '{known}'", there)
     return SupportGraph(
         tuple(o.decoded(name) for o in given.objects),
         tuple(Support(*vars(s).values()) for s in given.supports),

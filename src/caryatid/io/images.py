@@ -88,7 +88,7 @@ def decode_image(
                     reason = f"has pixels of mode {opened.mode}, not {what}"
                     raise BrokenImageError(source, reason, f"save it as {what}")
                 if width * height > max_pixels:
-                    reason = f"has {width}×{height} pixels, {max_pixels} are allowed"
+                    reason = f"{width}×{height} pixels exceed the limit of {max_pixels}"
                     raise InputError(source, reason, "give a smaller image, or raise recording.max_pixels")
                 return np.array(opened.convert("RGB") if modes is None or "RGB" in modes else opened)
     except FileNotFoundError:
@@ -97,7 +97,7 @@ def decode_image(
         reason = f"has more than {Image.MAX_IMAGE_PIXELS} pixels"
         raise BrokenImageError(source, reason, "give a smaller image") from None
     except UnidentifiedImageError as error:
-        raise BrokenImageError(source, "is not an image", remedy) from error
+        raise BrokenImageError(source, "not an image", remedy) from error
     except _BAD_BYTES as error:
         raise BrokenImageError(source, f"the image is truncated or broken ({error})", remedy) from error
 

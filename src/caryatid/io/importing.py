@@ -30,7 +30,7 @@ DARK: Final = "too few depth readings"
 SPARE: Final = "more than max_views"
 """Reasons why a frame does not become a view."""
 _REMEDIES: Final[Mapping[str, str]] = {
-    NO_COLOUR: "leave colour out, or allow longer gaps with --set recording.colour_gap=SECONDS",
+    NO_COLOUR: "omit colour, or allow longer gaps with --set recording.colour_gap=SECONDS",
     NO_POSE: "record poses throughout, or allow longer gaps with --set recording.pose_gap=SECONDS",
     DARK: "allow fewer with --set recording.min_readings=SHARE",
 }
@@ -86,7 +86,7 @@ def levelled(dataset: Dataset, config: Config) -> Dataset:
         return dataset
     T_level_world = _level_rotation(dataset, config)
     turn = np.rad2deg(transforms.angle_between(T_level_world[2, :3], _UP))
-    note = f"world: turned by {turn:.1f}°, so that the table is level"
+    note = f"world frame rotated by {turn:.1f}° to level the table"
     frames = [_turned(frame, T_level_world) for frame in dataset.frames]
     return replace(dataset, frames=frames, notes=(*dataset.notes, note))
 
@@ -125,7 +125,7 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
         sharpness.append(readings if grey is None else float(laplace(grey).var()))
     if not usable and not skipped:
         remedy = "record it again, or give another --depth TOPIC"
-        raise InputError(dataset.path, "holds no depth image", remedy)
+        raise InputError(dataset.path, "has no depth images", remedy)
     if not usable:
         reason = f"none of its {skipped.total()} depth images is usable: {reasons(skipped)}"
         remedy = _REMEDIES.get(skipped.most_common(1)[0][0], "record it again")
@@ -193,13 +193,13 @@ def _level_rotation(dataset: Dataset, config: Config) -> Array:
             T_level_camera = level_transform(replace(view, T_world_camera=None), config, rng)
             found.append(transforms.rotate(view.pose, T_level_camera[2, :3]))
     if not found:
-        raise InputError(dataset.path, "no view shows a table, which --level needs", "leave --level out")
+        raise InputError(dataset.path, "no view shows a table, which --level requires", "omit --level")
     ups = np.stack(found)
     between = transforms.angle_between(ups[:, None], ups[None])
     near = between[int(np.argmin(between.sum(axis=1)))] <= np.deg2rad(config.surface.max_tilt)
     if 2 * int(near.sum()) < len(ups):
         reason = f"only {int(near.sum())} of {len(ups)} views agree on which way is up"
-        raise InputError(dataset.path, reason, "leave --level out, and give poses in a level world")
+        raise InputError(dataset.path, reason, "omit --level, and give poses in a level world frame")
     turn, _ = Rotation.align_vectors(_UP[None], ups[near].mean(axis=0)[None])
     return transforms.rigid(turn.as_matrix(), np.zeros(3))
 

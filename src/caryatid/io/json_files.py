@@ -116,7 +116,7 @@ def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any
     except ValueError as error:
         raise InputError(path, f"broken JSON: {error}", remedy) from error
     if not isinstance(document, dict):
-        raise InputError(path, f"holds a {type(document).__name__}, not an object", remedy)
+        raise InputError(path, f"expected a JSON object, not a {type(document).__name__}", remedy)
     return document
 
 

@@ -42,7 +42,7 @@ def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
         return OnnxMasks(Path(name.removeprefix(ONNX)), config, seed)
     folder = Path(name)
     if not folder.is_dir():
-        raise InputError(name, "is not a directory of masks", "give one, or onnx:FILE")
+        raise InputError(name, "not a directory", "give a folder of masks, or onnx:FILE")
     return partial(with_stored_masks, folder, max_pixels=config.recording.max_pixels)
 
 
@@ -65,7 +65,7 @@ def with_stored_masks(folder: Path, view: View, max_pixels: int) -> View:
     elif array.exists():
         labels = read_npy(array)
     else:
-        raise InputError(folder, f"has no masks of '{name}'", f"add {image.name} or {array.name}")
+        raise InputError(folder, f"has no masks for '{name}'", f"add {image.name} or {array.name}")
     return replace(view, labels=labels, labels_are="segments")
 
 
@@ -113,7 +113,7 @@ class OnnxMasks:
         try:
             self._session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's own exceptions have no common base
-            reason = f"is not a model that onnxruntime can read ({' '.join(str(error).split())})"
+            reason = f"onnxruntime cannot read it ({' '.join(str(error).split())})"
             raise InputError(path, reason, "export it again") from None
         self._path, self._config, self._seed = path, config, seed
         inputs = {i.name: i for i in self._session.get_inputs()}
@@ -135,7 +135,7 @@ class OnnxMasks:
             InputError: It has no colour, or the model fails or does not return masks.
         """
         if view.rgb is None:
-            raise InputError(view.name, "has no colour image, which the model needs", "record colour")
+            raise InputError(view.name, "has no colour image, which the model requires", "record colour")
         height, width = self._size or view.depth.shape
         image = Image.fromarray(view.rgb).resize((width, height), Image.Resampling.BILINEAR)
         rgb = np.asarray(image, dtype=np.float32) / np.float32(255.0)

@@ -94,16 +94,16 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
     path = find_sample(path)
     parse = {".pcd": _parse_pcd, ".ply": _parse_ply}.get(path.suffix.lower())
     if parse is None:
-        raise InputError(path, "is not a .pcd or .ply file", "convert it to one of these")
+        raise InputError(path, "not a .pcd or .ply file", "convert it to one of these")
     with read_errors(path, "give a .pcd or .ply file"):
         content = path.read_bytes()
     try:
         columns, viewpoint = parse(content)
         points = _triple(columns, "x y z")
         if points is None or any(columns[axis].dtype.kind != "f" for axis in "xyz"):
-            raise ValueError("there are no fields x y z of floating point numbers")
+            raise ValueError("no floating-point fields x y z")
     except Exception as error:
-        reason = f"is broken, or its header is wrong: {_reason(error)}"
+        reason = f"broken file or header: {_reason(error)}"
         raise InputError(path, reason, "export the cloud again") from error
     normals = _triple(columns, "normal_x normal_y normal_z", "nx ny nz")
     labels = _labels(columns, label_divisor, path)
@@ -119,7 +119,7 @@ def _parse_pcd(content: bytes) -> tuple[Columns, Array]:
 
     end = re.search(rb"^DATA\b[^\n]*\n", content[:65536], re.MULTILINE)
     if end is None:
-        raise ValueError("there is no DATA line")
+        raise ValueError("no DATA line")
     lines = content[: end.end()].decode("ascii", errors="replace").splitlines()
     if not any(line.startswith("COUNT") for line in lines):
         names = next((line.split()[1:] for line in lines if line.startswith("FIELDS")), [])
@@ -128,7 +128,7 @@ def _parse_pcd(content: bytes) -> tuple[Columns, Array]:
     if not len(header.fields) == len(header.size) == len(header.type) == len(header.count):
         raise ValueError("FIELDS, SIZE, TYPE and COUNT do not agree")
     if max(header.count) > 1000:  # the library makes a field of each
-        raise ValueError(f"COUNT {max(header.count)}, at most 1000 are allowed")
+        raise ValueError(f"COUNT {max(header.count)} exceeds 1000")
     dtype = header.build_dtype()
     if header.width * header.height != header.points or header.points == 0:
         raise ValueError(f"WIDTH {header.width} × HEIGHT {header.height}, POINTS {header.points}")
@@ -163,7 +163,7 @@ def _parse_ply(content: bytes) -> tuple[Columns, Array]:
     names = data.keys() if isinstance(data, dict) else data.dtype.names
     columns = {name.lower(): np.asarray(data[name]).reshape(len(data[name]), -1)[:, 0] for name in names}
     if any(len(column) != vertex["length"] for column in columns.values()):
-        raise ValueError(f"there are not {vertex['length']} points")
+        raise ValueError(f"fewer than {vertex['length']} points")
     return columns, np.zeros(3)
 
 
@@ -173,7 +173,7 @@ def _reason(error: Exception) -> str:
         first = error.errors()[0]
         return f"{str(first['loc'][0]).upper()}: {first['msg'].lower()}"
     if isinstance(error, KeyError):
-        return f"there is no {error}"
+        return f"no {error}"
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
@@ -191,7 +191,7 @@ def _labels(columns: Columns, divisor: int, path: Path) -> NDArray[np.int32] | N
     raw = columns["label"].astype(np.float64)
     labels = raw // divisor
     if not ((raw >= 0.0) & (raw == np.floor(raw)) & (labels < SUPPORT_LABEL)).all():
-        reason = f"its labels are not all whole numbers from 0 to {divisor * SUPPORT_LABEL - 1}"
+        reason = f"labels are not all integers from 0 to {divisor * SUPPORT_LABEL - 1}"
         raise InputError(path, reason, "number objects from 1")
     return labels.astype(np.int32)
 

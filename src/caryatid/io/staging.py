@@ -131,13 +131,13 @@ class StagedFolder:
         if self._replaces:
             remedy += "; caryatid replaces only folders that it wrote"
         if not self._place.is_dir():
-            raise InputError(self.folder, "already exists and is not a folder", remedy)
+            raise InputError(self.folder, "already exists and is not a directory", remedy)
         own = self._replaces(self._place) if self._replaces else ()
         with write_errors(self.folder):
             for path in self._place.rglob("*"):
                 name = path.relative_to(self._place).as_posix()
                 if name not in own and (path.is_symlink() or not path.is_dir()):
-                    raise InputError(self.folder, f"already exists and holds other files ({name})", remedy)
+                    raise InputError(self.folder, f"already exists and contains other files ({name})", remedy)
 
 
 def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
@@ -152,7 +152,7 @@ def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
         InputError: It is a folder, or the disk cannot be written; nothing is left behind.
     """
     if path.is_dir():
-        raise InputError(path, "is a folder", "give a file")
+        raise InputError(path, "is a directory", "give a file")
     partial = _partial(path)
     with write_errors(path):
         try:
@@ -236,10 +236,10 @@ def write_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            reason, remedy = "the disk is full", "free some space or write elsewhere; nothing was left behind"
+            reason, remedy = "the disk is full", "free some space or write elsewhere; nothing was written"
         else:
             reason = f"cannot be written ({(error.strerror or str(error)).lower()})"
-            remedy = "give a folder you may write to"
+            remedy = "give a writable folder"
         raise InputError(path, reason, remedy) from error
 
 

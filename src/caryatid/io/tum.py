@@ -58,8 +58,8 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
         InputError: A list is missing or broken, or the camera is unknown.
     """
     if options != OpenOptions(camera_file=options.camera_file):
-        remedy = f"{path} is a TUM RGB-D folder; leave them out"
-        raise InputError("--depth, --info, --rgb, --tf", "are for bags", remedy)
+        remedy = f"{path} is a TUM RGB-D folder; omit them"
+        raise InputError("--depth, --info, --rgb, --tf", "apply only to bags", remedy)
     file, size, note = _read_camera(path, options.camera_file)
     K = np.array([[file.fx, 0.0, file.cx], [0.0, file.fy, file.cy], [0.0, 0.0, 1.0]])
     camera = TimedCamera(f"{path}: camera", 0, _CAMERA, check_intrinsics(K, str(options.camera_file)), size)
@@ -71,7 +71,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     if (path / "groundtruth.txt").is_file():
         pose_at = partial(_read_poses(path / "groundtruth.txt", config.pose_gap).between, _WORLD)
     else:
-        notes.append("no groundtruth.txt: poses are unknown, so a single frame is taken")
+        notes.append("no groundtruth.txt: poses are unknown, so only one frame is imported")
     return make_video(path, depths, colours, [camera], pose_at, config, notes)
 
 
@@ -82,7 +82,7 @@ def _read_camera(folder: Path, camera_file: Path | None) -> tuple[_CameraFile, t
         return parse_json(_CameraFile, document, camera_file), None, f"camera: {camera_file}"
     for name, (fx, fy, cx, cy) in PUBLISHED.items():
         if name in folder.resolve().name.lower():
-            note = f"camera: as published for {name}, fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} px"
+            note = f"published camera of {name}: fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} px"
             return _CameraFile(fx, fy, cx, cy), (640, 480), note
     reason = f"the camera is unknown: the folder's name contains none of {', '.join(PUBLISHED)}"
     raise InputError(folder, reason, 'give --camera FILE.json with {"fx": …, "fy": …, "cx": …, "cy": …}')
@@ -117,7 +117,7 @@ def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
         try:
             timed.append((int(Decimal(words[0]) * SECOND), words[1:]))
         except (InvalidOperation, ValueError, OverflowError):
-            raise _broken(path, "a row does not begin with a time in seconds") from None
+            raise _broken(path, "a row does not start with a time in seconds") from None
         if len(words) != columns:
             raise _broken(path, f"'{' '.join(words)}' has {len(words)} columns, not {columns}")
     return timed

@@ -133,14 +133,14 @@ def _load(
     shown = _described(size, depth.frame)
     if camera.size not in (None, size) or camera.frame != depth.frame:
         others = _described(camera.size or size, camera.frame)
-        reason = f"its images ({others}) are not the depth images ({shown})"
+        reason = f"its images ({others}) differ from the depth images ({shown})"
         raise InputError(camera.name, reason, "give the camera of the depth images")
     rgb = None if colour is None else colour.decode()
     if colour is not None and rgb is not None:
         registered = _described(rgb.shape[1::-1], colour.frame)
         if registered != shown:
             reason = f"depth ({shown}) is not registered to colour ({registered})"
-            raise InputError(depth.name, reason, "give depth aligned to colour, or leave colour out")
+            raise InputError(depth.name, reason, "give depth aligned to colour, or omit colour")
     near = np.where(metres <= far, metres, np.float32(0.0))
     return View(near, camera.K, T_world_camera, rgb, name=depth.name)
 

@@ -70,7 +70,7 @@ class ChangeDetector:
             self._odds[object_id] = max(odds.get(object_id, 0.0) + likelihood_ratio(through, confirmed), 0.0)
             if self._odds[object_id] > PRIOR_ODDS:
                 total = through + confirmed
-                missing[object_id] = f"{view.name} looks through {through} of {total} places of its surface"
+                missing[object_id] = f"{view.name} sees through {through} of {total} points of its surface"
         return missing
 
     def lose(self, object_id: str, o: SceneObject | None) -> None:
@@ -114,7 +114,7 @@ class ChangeDetector:
             present: Ids of all objects; one both lost and present was moved.
         """
         for object_id in sorted(self._lost.keys() | appeared.keys()):
-            why = missing.get(object_id) or appeared.get(object_id, "it was found again")
+            why = missing.get(object_id) or appeared.get(object_id, "found again")
             if object_id in present:
                 kind: ChangeKind = "moved" if self._lost.pop(object_id, None) else "added"
                 self.history = (*self.history, Change(kind, object_id, view, why))
@@ -141,7 +141,7 @@ def appeared(
         own = labels == label
         there, other = distinct(points_world[own & free]), distinct(points_world[own & ~free])
         if likelihood_ratio(there, other) > PRIOR_ODDS:
-            new[label] = f"{name} shows {there} of {there + other} places of it where space was free"
+            new[label] = f"{name} shows {there} of {there + other} of its points where space was free"
     return new
 
 

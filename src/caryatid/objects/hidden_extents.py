@@ -95,16 +95,16 @@ def _moved_out(
         return candidate
     (axis, sign), (points, rim) = side, face
     outward = sign * candidate.shape.T_world_object[:3, axis]
-    length, reason = limit, f"is taken to reach {aim}"
+    length, reason = limit, f"is assumed to reach {aim}"
     to_object = _way_to_others(points, outward, limit, others, config)
     if to_object < length:
         length, reason = to_object, "ends at the next object"
     to_free = _free_before(rim, outward, length, voxels, config)
     if to_free < length:
-        length, reason = to_free, "ends where free space was seen"
+        length, reason = to_free, "ends at free space"
     if length < LEAST:
         return candidate
-    why = f"a side that was not seen {reason}, {1000 * length:.0f} mm further"
+    why = f"an unseen side {reason}, {1000 * length:.0f} mm further"
     why = f"{candidate.why}; {why}" if candidate.why else why
     return replace(candidate, shape=_lengthened(candidate.shape, axis, sign, length), why=why)
 

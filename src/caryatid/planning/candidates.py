@@ -1,4 +1,4 @@
-"""The views a robot can reach, and the few of them that represent all."""
+"""Candidate views that a robot can reach, and a subset that represents them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Looks:
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """The views a robot can reach.
+    """Candidate views that a robot can reach.
 
     Attributes:
         T_world_camera: Camera poses (N, 4, 4).
@@ -53,7 +53,7 @@ class Candidates:
         return len(self.directions)
 
     def looks(self, count: int) -> Looks:
-        """Pick the views nearest to `count` directions all over the sphere, where there are any.
+        """Pick the views nearest to `count` directions spread over the sphere.
 
         If there are fewer than an eighth of that, all are picked. Cached for the same views.
         """
@@ -67,7 +67,7 @@ class Candidates:
         return self._looks[count]
 
     def without(self, index: int, reason: str) -> Candidates:
-        """Return the views without the one at an index, refused for a reason."""
+        """Return the views without the one at an index, which is rejected for a reason."""
         fields = (self.T_world_camera, self.directions, self.path_length)
         poses, directions, lengths = (np.delete(of_each, index, axis=0) for of_each in fields)
         indices = None if self.indices is None else np.delete(self.indices, index)
@@ -75,7 +75,7 @@ class Candidates:
         return Candidates(poses, directions, lengths, rejected, indices)
 
     def from_elsewhere(self, path_length: Array) -> Candidates:
-        """Return the same views for a robot elsewhere, with another path length (N,) [m] to each."""
+        """Return the same views for another robot position, with a path length (N,) [m] to each."""
         others = replace(self, path_length=path_length)
         object.__setattr__(others, "_looks", self._looks)
         return others

@@ -27,7 +27,7 @@ from caryatid.sensing.voxel_map import VoxelMap
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlanningState:
-    """Everything a planner may use.
+    """Input of a planner.
 
     Attributes:
         graph: The fused support graph.
@@ -69,7 +69,7 @@ class PaintedLate:
 
 @dataclass(frozen=True, eq=False)
 class Decision(Pictured):
-    """The next best view and why.
+    """The next best view and its reason.
 
     Attributes:
         T_world_camera: Pose (4, 4) to go to.
@@ -98,7 +98,7 @@ class Decision(Pictured):
     waypoints: tuple[Posture, ...] = ()
 
     def with_waypoints(self, waypoints: tuple[Posture, ...]) -> Decision:
-        """Return the same decision with the way there."""
+        """Return the same decision with waypoints."""
         decision = copy.copy(self)
         object.__setattr__(decision, "waypoints", waypoints)
         return decision
@@ -131,11 +131,11 @@ def check_candidates(state: PlanningState) -> None:
     """
     if len(state.candidates) == 0:
         reasons = ", ".join(f"{reason} ({n})" for reason, n in state.candidates.rejected.items())
-        raise PlanningError(f"no view is left to go to: {reasons or 'the robot offers no candidates'}")
+        raise PlanningError(f"no candidate views left: {reasons or 'the robot offers no candidates'}")
 
 
 def path_cost(state: PlanningState) -> Array:
-    """Cost of going to each candidate, h(v) of eq. 3 (N,).
+    """Path cost of each candidate, h(v) of eq. 3 (N,).
 
     `angle`: sin(α/2), α the angle at the sphere's centre between the current view and the candidate.
     `path`: the path length in diameters of the view sphere. `none`: nothing.
@@ -160,7 +160,7 @@ def decide(
     points: tuple[PointOfInterest, ...] = (),
     elsewhere: Callable[[], Array],
 ) -> Decision:
-    """Choose the view with the largest c = s − h, eq. 3; the first of equal ones.
+    """Choose the view with the largest c = s − h, eq. 3; the first in case of a tie.
 
     Args:
         candidates: The views that can be reached.

@@ -1,4 +1,4 @@
-"""A goal: an object to remove decides where to look, and when to stop."""
+"""Goals: where to look, and when to stop, if one object is to be removed."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def matter(samples: Samples, graph: SupportGraph, goal: str | None) -> NDArray[n
 def settled(
     graph: SupportGraph, goal: str | None, until: float, voxels: VoxelMap, config: SupportConfig
 ) -> bool:
-    """Whether everything that matters is known with a probability of at least `until`.
+    """Whether everything relevant is known with a probability of at least `until`.
 
     Without a goal, this is the existence of every support. With a goal, it is whether each object moves or
     stays when the goal is removed, and that nothing unseen rests on the goal: at least that share of its

@@ -17,7 +17,7 @@ from caryatid.sensing.view_sphere import ViewSphere, spread
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PointOfInterest:
-    """A point in the scene worth another look.
+    """A point of interest in the scene.
 
     Attributes:
         position_world: (3,) [m].
@@ -57,7 +57,7 @@ def points_of_interest(
             continue
         supports = graph.supporters(supported.id)
         if not supports:
-            reason = f"nothing is known to support {supported.id}"
+            reason = f"the supporter of {supported.id} is unknown"
             points.append(_looked_at(supported, sphere, middle, reason))
         for support in supports:
             position = (centres[support.supporter] + centres[support.supported]) / 2.0
@@ -108,7 +108,7 @@ def relation_saliency(occurrences: int, views: int, config: ActiveVisionConfig) 
 
 
 def surface_point(shape: Shape, towards_world: Array) -> Array:
-    """Where the line from a shape's centre to an outer point (3,) [m] leaves the shape (3,) [m]."""
+    """Point (3,) [m] where the line from a shape's centre to an outer point (3,) [m] leaves the shape."""
     centre = shape.T_world_object[:3, 3]
     inside, outside = 0.0, 1.0
     for _ in range(40):

@@ -1,4 +1,4 @@
-"""How a robot holds its camera; a decision holds the postures on its way."""
+"""Posture of a robot at a camera pose."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Posture:
-    """How the robot holds its camera at a pose.
+    """Posture of a robot at a camera pose.
 
     Attributes:
         platform_world: Platform (3,): x, y, yaw [m, m, rad].

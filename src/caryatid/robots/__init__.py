@@ -92,7 +92,7 @@ def find_robot(name: str) -> RobotMaker:
     others = offered()
     if name not in others and ":" not in name:
         names = ", ".join([HUMANOID, *sorted(others), f"{ARM}FILE.npz", "module:callable"])
-        raise InputError("robot", f"there is no robot '{name}'", f"choose one of {names}")
+        raise InputError("robot", f"unknown robot '{name}'", f"choose one of {names}")
     point = others.get(name) or EntryPoint(name, name, ENTRY_POINTS)
     try:
         maker: RobotMaker = point.load()
@@ -126,4 +126,4 @@ def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:
             return T_world_camera
         rejected[refused.reason] = rejected.get(refused.reason, 0) + 1
     reasons = ", ".join(f"{reason} ({count})" for reason, count in rejected.items())
-    raise PlanningError(f"no view of the sphere can be reached: {reasons}")
+    raise PlanningError(f"no view of the view sphere is reachable: {reasons}")

@@ -1,4 +1,4 @@
-"""An arm with a camera in its hand: the views of its sphere that it reaches, and their rolls."""
+"""An arm with a wrist camera: the reachable views of its view sphere, and their rolls."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from caryatid.robots.protocol import (
 from caryatid.sensing.view_sphere import ViewSphere
 
 Reachable = Callable[[Array], NDArray[np.bool_]]
-"""Which camera poses the hand reaches: `T_base_camera` (N, 4, 4) → (N,)."""
+"""Function that tests which camera poses are reachable: `T_base_camera` (N, 4, 4) → (N,)."""
 
 REASONS = (
     "the camera would be too low over the table",
-    "a wall stands in the line of sight",
-    "the hand does not reach there",
+    "a wall blocks the line of sight",
+    "out of the hand's reach",
 )
-"""Why a view is refused; the first that applies counts."""
+"""Reasons to reject a view; the first that applies counts."""
 
-UNCONFIRMED = "the arm cannot go there on a closer look"
+UNCONFIRMED = "rejected by the arm's confirm()"
 """Why `confirm` refuses a view."""
 
 RADIUS_SHARE = 0.65

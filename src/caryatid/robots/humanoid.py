@@ -19,12 +19,12 @@ REASONS = (
     "the camera would be too high",
     "the head pitch is beyond its limits",
     "the camera would be rolled",
-    "the platform would stand outside the floor",
-    "the platform would stand in an obstacle",
-    "no path leads there",
-    "a wall stands in the line of sight",
+    "the platform would be off the floor",
+    "the platform would hit an obstacle",
+    "no free path",
+    "a wall blocks the line of sight",
 )
-"""Why a view is refused; the first that applies counts."""
+"""Reasons to reject a view; the first that applies counts."""
 
 Indices = NDArray[np.intp]
 """Whole numbers (N,)."""

@@ -32,7 +32,7 @@ class Unreachable:
 
 
 class Robot(Protocol):
-    """Carries the camera. A robot that chooses its own views also inherits `OwnViews`."""
+    """A robot that carries the camera. If it needs its own view sphere, it also inherits `OwnViews`."""
 
     @property
     def T_world_camera(self) -> Array:
@@ -70,11 +70,11 @@ class OwnViews:
         return proposed
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
-        """Say why a chosen candidate (4, 4) cannot be taken after all, so that another is chosen; or None."""
+        """Return why a chosen candidate (4, 4) is rejected after a closer check, or None to accept it."""
         return None
 
     def waypoints(self, T_world_camera: Array) -> Sequence[Posture]:
-        """Return the postures on the way to a pose (4, 4), with both ends and straight lines in between.
+        """Return the postures on the path to a pose (4, 4), both ends included, joined by straight lines.
 
         An empty sequence = only the posture at the pose is known, from `solve`.
         """
@@ -95,7 +95,7 @@ class SimulatedRobot(Robot):
             PlanningError: It has no pose yet.
         """
         if self._T_world_camera is None:
-            raise PlanningError("the robot has no pose yet; move it to a first view")
+            raise PlanningError("the robot has no camera pose yet; move it to a first view")
         return self._T_world_camera
 
     def _posture_at(self, T_world_camera: Array) -> Posture:
@@ -106,7 +106,7 @@ class SimulatedRobot(Robot):
         """
         posture = self.solve(T_world_camera)
         if isinstance(posture, Unreachable):
-            raise PlanningError(f"the robot cannot go to this view: {posture.reason}")
+            raise PlanningError(f"the robot cannot reach this view: {posture.reason}")
         return posture
 
     def _go(self, posture: Posture, T_world_camera: Array) -> float:

@@ -82,12 +82,14 @@ def sample_reachability(
     config = config or ArmConfig()
     bounds = np.asarray(limits, dtype=np.float64)
     if bounds.ndim != 2 or bounds.shape[1] != 2 or len(bounds) == 0 or not np.isfinite(bounds).all():
-        raise InputError("limits", f"shape {bounds.shape} is not (J, 2) of finite numbers", "give low, high")
+        raise InputError(
+            "limits", f"expected finite numbers (J, 2), not shape {bounds.shape}", "give (low, high)"
+        )
     crossed = np.flatnonzero(bounds[:, 0] > bounds[:, 1])
     if len(crossed):
-        raise InputError("limits", f"joint {crossed[0]} begins above its end", "give the lowest value first")
+        raise InputError("limits", f"joint {crossed[0]} has low > high", "give the lower limit first")
     if count < 1:
-        raise InputError("count", f"{count} postures make no map", "draw some hundred thousand")
+        raise InputError("count", f"{count} is too few", "sample some hundred thousand postures")
     bins = _Bins(config.view_directions)
     held = []
     for part in np.array_split(np.arange(count), min(10, count)):
@@ -133,18 +135,18 @@ def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
     try:
         held = dict(np.load(io.BytesIO(content), allow_pickle=False))
     except Exception as error:  # NumPy raises many kinds of error for a damaged archive
-        raise InputError(file, f"is not a readable .npz: {error}", REMEDY) from None
+        raise InputError(file, f"not a readable .npz: {error}", REMEDY) from None
     if str(held.get("format")) != FORMAT:
-        raise InputError(file, f"is not a reachability map, its format is not '{FORMAT}'", REMEDY)
+        raise InputError(file, f"not a reachability map, expected format '{FORMAT}'", REMEDY)
     if not np.array_equal(held.get("version", 0), VERSION):
-        raise InputError(file, f"has version {held.get('version')}, not {VERSION}", REMEDY)
+        raise InputError(file, f"version {held.get('version')} is not supported, only {VERSION}", REMEDY)
     reached = held.get("reached", np.zeros(0))
     good = reached.ndim == 4 and reached.dtype == np.uint8 and reached.size > 0
     for name, shape in (("origin_base", (3,)), ("cell", ()), ("fresh", ())):
         value = held.get(name, np.zeros(0))
         good &= value.shape == shape and value.dtype.kind == "f" and bool(np.isfinite(value).all())
     if not good or held["cell"] <= 0.0:
-        raise InputError(file, "its arrays are not those of a reachability map", REMEDY)
+        raise InputError(file, "not the arrays of a reachability map", REMEDY)
     return ReachabilityMap(reached, held["origin_base"], float(held["cell"]), float(held["fresh"]))
 
 

@@ -41,9 +41,9 @@ class RecordingRobot(SimulatedRobot):
         if index is None:
             nearest = float(np.linalg.norm(self._recorded[:, :3, 3] - T[:3, 3], axis=-1).min())
             why = f"the nearest of its {len(self._recorded)} views is {nearest:.2f} m away"
-            return Unreachable(f"the recording has no view from there; {why}")
+            return Unreachable(f"the recording has no view at this pose; {why}")
         if index in self._used:
-            return Unreachable(f"view {index + 1} of the recording has already been used")
+            return Unreachable(f"view {index + 1} of the recording was already used")
         forward = T[:3, 2]
         return posture_at(T, np.array([T[0, 3], T[1, 3], np.arctan2(forward[1], forward[0])]))
 
@@ -52,7 +52,7 @@ class RecordingRobot(SimulatedRobot):
         left = [index for index in range(len(self._recorded)) if index not in self._used]
         poses = self._recorded[left]
         lengths, nowhere = straight_lengths(self._T_world_camera, poses), len(sphere.directions)
-        rejected = {"already used": len(self._used), "the recording has no view from there": nowhere}
+        rejected = {"already used": len(self._used), "the recording has no view at this pose": nowhere}
         return Candidates(poses, sphere.direction_of(poses), lengths, rejected)
 
     def _go(self, posture: Posture, T_world_camera: Array) -> float:
@@ -74,7 +74,7 @@ class RecordingCamera:
     def __init__(self, recording: Dataset) -> None:
         if len(recording) > 1 and not recording.has_poses:
             remedy = "add cam_R_w2c and cam_t_w2c to each"
-            raise InputError(recording.path, "has several frames without poses", remedy)
+            raise InputError(recording.path, "several frames have no poses", remedy)
         self._recording = recording
 
     def capture(self, T_world_camera: Array) -> View:

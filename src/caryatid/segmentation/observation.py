@@ -98,7 +98,7 @@ def observe(
     source = thinned(source, config.cloud)
     if isinstance(source, View) and source.T_world_camera is None:
         if known is not None:
-            raise InputError(source.name, "has no camera pose", "only a single view may come without one")
+            raise InputError(source.name, "has no camera pose", "give one; only the first view may lack it")
         source = source.with_pose(level_transform(source, config, rng, use_labels=use_labels))
     if use_labels and isinstance(source, View):
         source = _with_whole_masks(source, 2.0 * config.segmentation.edge_jump)
@@ -194,7 +194,7 @@ def _points(
     """
     if isinstance(source, Cloud):
         if len(source) == 0:
-            raise PerceptionError(f"{source.name}: holds no points")
+            raise PerceptionError(f"{source.name}: has no points")
         return source, np.arange(len(source), dtype=np.intp)
     among = None
     if known is not None:
@@ -214,10 +214,10 @@ def _why_nothing(view: View, config: CloudConfig) -> str:
     """Say why a view holds no oriented points, and what may help."""
     readings, near, far = view.depth[view.valid], config.min_depth, config.max_depth
     if len(readings) == 0:
-        return "has no depth readings; leave it out"
+        return "has no depth readings; omit it"
     if ((readings >= near) & (readings <= far)).any():
-        why = "pixels side by side are too few, or differ too much in depth"
-        return f"shows no surface: {why}; give a larger image, or one with less noise"
+        why = "neighbouring pixels are too few, or differ too much in depth"
+        return f"shows no surface: {why}; give a larger or less noisy image"
     ends = dict.fromkeys(f"{end:.3g}" for end in (readings.min(), readings.max()))
     remedy = "check the unit of depth, or set cloud.min_depth and cloud.max_depth"
     return f"all depth readings are at {'–'.join(ends)} m, none within {near:g}–{far:g} m; {remedy}"
@@ -257,8 +257,8 @@ def _surface(
     loose = np.ones(len(cloud), dtype=bool) if given is None else given == 0
     if known is None and not loose.any():
         raise NoSurfaceError(
-            f"{cloud.name}: every point has the label of an object, none is left for the table; give the "
-            "table label 0 (of a cloud --label-divisor may do so), or use --segmentation auto"
+            f"{cloud.name}: every point has the label of an object, and none is left for the table; give the "
+            "table label 0 (for a cloud, try --label-divisor), or use --segmentation auto"
         )
     if known is not None:
         loose &= np.abs(known.height(cloud.points_world)) < config.surface.search

@@ -224,7 +224,7 @@ def _tried(scene: _Scene, rng: np.random.Generator) -> str:
     """Say why no support surface was found, and what may help."""
     points, normals, up, config = scene
     if len(points) < config.min_points:
-        few = f"only {len(points)} points are on a surface, {config.min_points} are needed"
+        few = f"only {len(points)} points are on a surface, fewer than {config.min_points}"
         return f"{few}; show more of the table top, or give a larger image"
     level = "plane" if up is None else "level plane"
     tried = f"fewer than {config.min_points} of {len(points)} points lie on one {level}"
@@ -233,8 +233,8 @@ def _tried(scene: _Scene, rng: np.random.Generator) -> str:
     if up is None or plane is None:
         return f"{tried}; show the table top"
     share, tilt = plane.inliers.mean(), np.degrees(transforms.angle_between(plane.normal, up))
-    tried += f"; the largest plane, {share:.0%} of them, leans by {tilt:.0f}°"
-    return f"{tried}; show the table top or, if that plane is it, level the world (--level)"
+    tried += f"; the largest plane, {share:.0%} of them, is tilted by {tilt:.0f}°"
+    return f"{tried}; show the table top or, if that plane is the table, use --level"
 
 
 def refitted(
@@ -269,7 +269,7 @@ def _surface(points: Array, plane: _Plane) -> SupportSurface:
     basis, thickness = _basis(plane.normal), 0.04
     corners = hull(np.ascontiguousarray((on_plane - centroid) @ basis.T))
     if len(corners) < 3:
-        raise NoSurfaceError("no support surface: the points on its plane lie on one line")
+        raise NoSurfaceError("no support surface: the points of the plane are collinear")
     edges = transforms.unit(np.roll(corners, -1, axis=0) - corners)
     along, across = corners @ edges.T, corners @ np.stack([-edges[:, 1], edges[:, 0]])
     sizes = np.stack([np.ptp(along, axis=0), np.ptp(across, axis=0)])

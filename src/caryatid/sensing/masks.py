@@ -43,7 +43,7 @@ def labels_from_masks(
             raise InputError(
                 "scores",
                 f"have shape {quality.shape} or hold NaN for {len(stack)} masks",
-                "give one finite score a mask, or none at all",
+                "give one finite score per mask, or no scores",
             )
     pixels = stack.sum(axis=(1, 2))
     kept = (pixels >= config.min_pixels) & (pixels <= config.max_share * stack[0].size)
@@ -76,9 +76,7 @@ def _stack(masks: ArrayLike | Sequence[ArrayLike]) -> tuple[Masks, NDArray[np.fl
     if stack.dtype == np.bool_ or np.isin(stack, (0, 1)).all() or np.isin(stack, (0, 255)).all():
         return stack.astype(bool), None
     if not np.issubdtype(stack.dtype, np.floating) or not ((stack >= 0.0) & (stack <= 1.0)).all():
-        raise InputError(
-            "masks", "hold neither true and false nor scores in [0, 1]", "threshold them first: masks > 0"
-        )
+        raise InputError("masks", "neither boolean nor scores in [0, 1]", "threshold them first: masks > 0")
     return stack >= 0.5, stack
 
 

@@ -63,7 +63,7 @@ class View(Pictured):
         depth = np.where(np.isnan(depth), np.float32(0.0), depth)
         if np.isinf(depth).any() or (depth < 0.0).any():
             bad = "infinite" if np.isinf(depth).any() else "negative"
-            raise InputError(self.name, f"depth holds {bad} values", "mark missing readings with 0 or NaN")
+            raise InputError(self.name, f"depth contains {bad} values", "mark missing readings with 0 or NaN")
         # Anything nearer than a micrometre is not a reading, and its inverse may be infinite.
         depth = np.where(depth < 1e-6, np.float32(0.0), depth)
         object.__setattr__(self, "depth", depth)
@@ -94,11 +94,11 @@ class View(Pictured):
                     self.name, reason, "give (H, W, 3) uint8, such as (255 * rgb).astype(np.uint8)"
                 )
             if field == "labels" and (image.dtype.kind == "f" and (image != np.rint(image)).any()):
-                remedy = "give whole numbers (H, W), or a stack of masks (N, H, W)"
-                raise InputError(self.name, "labels are not whole numbers", remedy)
+                remedy = "give integers (H, W), or a stack of masks (N, H, W)"
+                raise InputError(self.name, "labels are not integers", remedy)
             if field == "labels" and ((image < 0).any() or (image >= SUPPORT_LABEL).any()):
                 raise InputError(
-                    self.name, f"labels leave 0…{SUPPORT_LABEL - 1}", "number objects from 1, 0 = nothing"
+                    self.name, f"labels exceed 0…{SUPPORT_LABEL - 1}", "number objects from 1, 0 = no object"
                 )
             object.__setattr__(self, field, image.astype(dtype, copy=False))
         if self.ignored is not None:
@@ -287,7 +287,7 @@ def _numbers(values: Any, dtype: DTypeLike | None, name: str) -> NDArray[Any]:
         array = np.array(None)
     if array.dtype.kind not in "biuf":
         raise InputError(
-            name, f"is not an array of numbers but {type(values).__name__}", "give a NumPy array"
+            name, f"expected an array of numbers, not {type(values).__name__}", "give a NumPy array"
         )
     return array
 

@@ -143,14 +143,14 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
             remedy = f"did you mean {meant[0]}? `caryatid scenes` lists all"
         raise InputError(path, "no such file or scene", remedy)
     if not path.is_file():
-        raise InputError(path, "is not a file", "give an MJCF file")
+        raise InputError(path, "not a file", "give an MJCF file")
     _check_sizes(path, config or PhysicsConfig())
     try:
         with mujoco_warnings_ignored():
             spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise InputError(path, f"is not an MJCF file ({reason})", "correct the XML") from None
+        raise InputError(path, f"not an MJCF file ({reason})", "correct the XML") from None
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
     return scene_from_spec(spec, name or path.stem, str(path), config)
 
@@ -173,7 +173,7 @@ def _check_sizes(path: Path, config: PhysicsConfig) -> None:
             copies.append(copies[-1] * size if many else copies[-1])
             size, most = (copies[-1], config.max_copies) if many else (size, config.max_cells)
             if size > most:
-                reason = f"its {element.tag} has {size:.4g} elements, {most} are allowed"
+                reason = f"its {element.tag} has {size:.4g} elements, more than {most}"
                 raise InputError(path, reason, "make it smaller")
 
 

@@ -87,12 +87,12 @@ def scene_from_spec(
             model = spec.compile()
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise InputError(source, f"MuJoCo refuses it: {reason}", "correct the MJCF") from None
+        raise InputError(source, f"MuJoCo rejects it: {reason}", "correct the MJCF") from None
     rest, step = (config or PhysicsConfig()).rest_window, model.opt.timestep
     if not 1e-5 <= step <= rest:
         raise InputError(source, f"its time step is {step:g} s", f"give option timestep 0.00001 to {rest:g}")
     if not np.isfinite(model.qpos0).all():
-        raise InputError(source, "a body's pose holds NaN or infinity", "give finite positions")
+        raise InputError(source, "the pose of a body contains NaN or infinity", "give finite positions")
     table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, TABLE)
     free = sorted(model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist())
     if table < 0:

@@ -45,14 +45,14 @@ def offered() -> dict[str, EntryPoint]:
 
 
 def make_planner(name: Planner | str) -> Planner:
-    """Return the planner of this name; a planner is returned as it is.
+    """Return the planner of this name; a planner is returned unchanged.
 
     Raises:
         InputError: There is none, and the message lists the known ones; or it is `oracle`.
     """
     planner: Planner
     if not isinstance(name, str):
-        check_type("planner", name, "plan", "give the name of a planner, or an object with its method plan()")
+        check_type("planner", name, "plan", "give the name of a planner, or an object with a method plan()")
         return name
     if name in BUILT_IN:
         module, maker, *arguments = BUILT_IN[name]
@@ -65,8 +65,8 @@ def make_planner(name: Planner | str) -> Planner:
     if name == ORACLE:
         raise InputError(
             "planner",
-            f"'{ORACLE}' needs a simulated scene, whose ground truth is known",
-            "give a scene, or make it with caryatid.evaluation.oracle.OraclePlanner",
+            f"'{ORACLE}' requires the ground truth of a simulated scene",
+            "give a scene, or create caryatid.evaluation.oracle.OraclePlanner",
         )
     names = ", ".join([*BUILT_IN, *sorted(others), ORACLE])
-    raise InputError("planner", f"there is no planner '{name}'", f"choose one of {names}")
+    raise InputError("planner", f"unknown planner '{name}'", f"choose one of {names}")

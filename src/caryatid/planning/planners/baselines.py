@@ -13,17 +13,17 @@ STOPS = 5
 
 
 class RandomPlanner:
-    """Goes to any reachable view, all equally likely."""
+    """Chooses a reachable view at random, with equal probability."""
 
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
         """Choose one of the candidates at random."""
         check_candidates(state)
         index = int(rng.integers(len(state.candidates)))
-        return go_to(state, index, f"one of {len(state.candidates)} reachable views, drawn at random")
+        return go_to(state, index, f"random choice among {len(state.candidates)} reachable views")
 
 
 class FarthestPlanner:
-    """Goes where the smallest angle to any earlier view is largest: coverage of the view sphere."""
+    """Maximises the smallest angle to any earlier view, to cover the view sphere."""
 
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
         """Choose the farthest candidate; of equal ones the first."""
@@ -32,7 +32,7 @@ class FarthestPlanner:
         nearest = (directions @ state.visited.T).max(axis=1)
         index = int(np.argmin(nearest))
         angle = np.rad2deg(transforms.angle_between(state.visited, directions[index]).min())
-        return go_to(state, index, f"{angle:.0f}° from the nearest earlier view, farther than any other")
+        return go_to(state, index, f"farthest from earlier views: {angle:.0f}° from the nearest")
 
 
 class RingPlanner:

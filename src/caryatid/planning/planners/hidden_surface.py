@@ -1,4 +1,4 @@
-"""The default planner: look where most of what is hidden becomes visible.
+"""The default planner: look where the most hidden surface becomes visible.
 
 As in Algorithm 2, it maximises c = s − h with inhibition of return over the reachable part of the view
 sphere. s is what a candidate would show for the first time: the surface of the fitted objects, the least
@@ -44,7 +44,7 @@ WORTH_SAYING = 0.05
 
 
 class SupportPlanner:
-    """Chooses the candidate that promises to show most of what is hidden, at little cost."""
+    """Chooses the candidate that is expected to show the most hidden surface at low path cost."""
 
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
         """Choose the candidate with the largest c = s − h, eq. 3; the first of equal ones.
@@ -116,7 +116,7 @@ def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[
         if np.linalg.norm(outward) < 1e-9:
             outward = middle - state.sphere.centre_world
         subject = () if name == SPACE else (name,)
-        why = f"{name} on the table" if name == SPACE else f"part of {name} has not been seen"
+        why = f"{name} on the table" if name == SPACE else f"part of {name} is unseen"
         saliency = float(worth[i] / worth.max())
         points.append(PointOfInterest(middle, transforms.unit(outward), saliency, subject, why))
     return points
@@ -126,11 +126,11 @@ def _why(samples: Samples, gain: Array) -> str:
     """One sentence: which objects a view shows more of."""
     total = float(gain.sum())
     if total <= 0.0:
-        return "nothing hidden is expected to come into sight; the cheapest new view"
+        return "no view is expected to show anything hidden; the cheapest new view"
     worth: dict[str, float] = {}
     shares = np.bincount(samples.subjects, weights=gain, minlength=len(samples.names))
     for name, share in zip(samples.names, shares, strict=True):
         worth[name] = worth.get(name, 0.0) + float(share)
     ranked = sorted(worth.items(), key=lambda item: -item[1])[:3]
     parts = [f"{name} ({share / total:.0%})" for name, share in ranked if share > WORTH_SAYING * total]
-    return "shows most of what is still hidden: " + ", ".join(parts)
+    return "shows the most hidden surface: " + ", ".join(parts)

@@ -44,7 +44,7 @@ class PaperPlanner:
 
         def why(best: int) -> str:
             if strongest[best] < 0:
-                return "no point of interest is in reach; the nearest new view"
+                return "no point of interest is reachable; the nearest new view"
             return added[strongest[best]].why
 
         return decide(
