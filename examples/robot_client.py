@@ -74,7 +74,7 @@ class RobotClient:
         return self._ask("GET", f"/sessions/{name}/graph")
 
     def take(self, name: str, object_id: str, T: Matrix | None = None) -> dict[str, Any]:
-        """Report that an object was taken away, or moved by a rigid transform T of the world."""
+        """Report that an object was removed, or moved by a rigid transform T in the world frame."""
         return self._ask("POST", f"/sessions/{name}/reports", {"object": object_id, "T": T})
 
     def undo(self, name: str) -> dict[str, Any]:

@@ -341,7 +341,7 @@ def test_the_command_writes_tables_figures_and_pages_of_what_there_is(tmp_path, 
     assert list(parquet.columns) == list(lines[0])
     assert parquet["f1"].dropna().tolist() == known
     assert run_command("benchmark", "--out", out, "--reference", "nobody") == 1
-    assert "no such method; choose one of support, random, oracle" in capsys.readouterr().err
+    assert "unknown method; choose one of support, random, oracle" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -32,6 +32,11 @@ BANNED = {
     r"\bgoes on where\b|\bgo on with\b": "continue",
     r"\bsomething else than\b": "anything but",
     r"\bas it is by now\b": "current",
+    r"\btaken away\b": "removed",
+    r"\bleave \S+ out\b": "omit",
+    r"\bthere is no (?:such|\w+ ')": "unknown …, no such …",
+    r"\bnothing has been seen\b": "the scene has no views",
+    r"\bwhole number of at\b|\bwhole numbers\b": "integer",
 }
 """Pattern → what to write in its place."""
 

@@ -193,7 +193,7 @@ def check_reference(reference: str | None, store: ResultStore) -> None:
     methods = {member.method: None for members in store.suites.values() for member in members}
     if reference is not None and reference not in methods:
         names = ", ".join(methods) or "none yet"
-        raise InputError(f"--reference {reference}", "there is no such method", f"choose one of {names}")
+        raise InputError(f"--reference {reference}", "unknown method", f"choose one of {names}")
 
 
 def _write_tables(store: ResultStore, folder: Path) -> None:

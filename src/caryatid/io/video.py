@@ -81,7 +81,7 @@ def make_video(
     Args:
         path: File or folder.
         depths: Depth images; they are numbered in this order.
-        colours: Colour images, or None to leave colour out.
+        colours: Colour images, or None to omit colour.
         cameras: Cameras of the depth images, at least one.
         pose_at: Pose (4, 4) of a frame at a time [ns], or None if unknown. None leaves poses out.
         config: Maximum time between depth and colour, and maximum depth.

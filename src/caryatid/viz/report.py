@@ -328,7 +328,7 @@ def _sphere_caption(step: Step) -> str:
     return text
 
 
-# Objects being taken away
+# Lifts
 
 
 def draw_lift(
