@@ -201,7 +201,7 @@ def test_what_is_no_result_of_this_code_is_refused_and_left_as_it_is(tmp_path):
         ResultStore(path)
     with ResultStore(path, "code", {"version": "0.1"}):
         pass
-    with pytest.raises(InputError, match=r"made by other code \(0.1 code\).*another --out"):
+    with pytest.raises(InputError, match=r"the code differs \(0.1 code\).*another --out"):
         ResultStore(path, "newer")
     for content in (b"not JSON, not at all", b"no\nlines\n", b'{"cakes": 1}\n'):
         path.write_bytes(content)

@@ -119,7 +119,7 @@ def test_only_objects_can_be_taken_and_only_what_is_rigid_moves(scene):
             scene.removed(object_id)
     with pytest.raises(InputError, match="T"):
         scene.moved("o5", np.diag([2.0, 1.0, 1.0, 1.0]))
-    with pytest.raises(InputError, match="look first"):
+    with pytest.raises(InputError, match="add a view first"):
         Scene().added(box((0.0, 0.0, 0.8), (0.1, 0.1, 0.1)))
     assert scene.changes == ()
 

@@ -142,7 +142,7 @@ def test_an_older_run_is_replaced_at_the_end_and_not_before(tmp_path):
 def test_a_run_is_not_replaced_where_it_holds_what_no_run_wrote(tmp_path):
     write_run(tmp_path / "RUN", views=2, seed=1)
     (tmp_path / "RUN/views/notes.txt").write_text("mine")
-    with refusal(tmp_path / "RUN", "holds other files (views/notes.txt)"):
+    with refusal(tmp_path / "RUN", "contains other files (views/notes.txt)"):
         writer(tmp_path / "RUN")
     assert read_run(tmp_path / "RUN").record["seed"] == 1
 
@@ -172,7 +172,7 @@ def test_what_is_no_run_is_never_touched(tmp_path, name):
     folder = tmp_path / "thesis"
     folder.mkdir()
     (folder / name).write_text('{"format": "something else"}')
-    with refusal(folder, "holds other files"):
+    with refusal(folder, "contains other files"):
         writer(folder)
     assert (folder / name).read_text() == '{"format": "something else"}'
     assert [p.name for p in tmp_path.iterdir()] == ["thesis"]
@@ -180,7 +180,7 @@ def test_what_is_no_run_is_never_touched(tmp_path, name):
 
 def test_files_and_empty_folders_in_the_way(tmp_path):
     (tmp_path / "file").write_text("kept")
-    with pytest.raises(InputError, match="not a folder"):
+    with pytest.raises(InputError, match="not a directory"):
         writer(tmp_path / "file")
     with pytest.raises(InputError, match="file/RUN"):
         writer(tmp_path / "file" / "RUN")

@@ -117,7 +117,7 @@ def test_another_exploration_than_its_own_is_refused(wrong):
     oracle = OraclePlanner(stage.camera, truth_of("tower"), CONFIG, segmentation="labels")
     camera, seed = (stage.camera, 0) if wrong == "camera" else (oracle.camera, 1)
     steps = explore(camera, stage.robot, planner=oracle, config=CONFIG, segmentation="labels", seed=seed)
-    with pytest.raises(InputError, match="not those of this exploration; pass its camera"):
+    with pytest.raises(InputError, match="differ from those of this exploration; pass its camera"):
         list(steps)
 
 

@@ -203,7 +203,7 @@ def test_of_large_images_as_many_pixels_are_used_as_points_are_kept(caplog):
     scene = Scene(segmentation="labels")
     with caplog.at_level("INFO"):
         graph = scene.update(view)
-    assert "641×480 of 1281×959 pixels are used" in caplog.text
+    assert "using 641×480 of 1281×959 pixels" in caplog.text
     assert scene.labels.shape == view.depth.shape
     objects = (scene.labels > 0) & (scene.labels != SUPPORT_LABEL)
     assert (scene.labels == view.labels)[objects].mean() > 0.98

@@ -173,7 +173,7 @@ def test_what_cannot_be_used_changes_nothing(client, views):
 NOT_BEGUN = (
     ({"name": "../b"}, 422, "name"),
     ({"name": "b" * 65}, 422, "name"),
-    ({"name": "b", "planner": "juggler"}, 422, "no planner 'juggler'"),
+    ({"name": "b", "planner": "juggler"}, 422, "unknown planner 'juggler'"),
     ({"name": "b", "settings": {"fit": {"hypotheses": 0}}}, 422, "fit.hypotheses"),
     ({"name": "b", "settings": {"voxels": {"size": 1e-6}}}, 422, "voxels"),
     ({"name": "b", "settings": {"active": {"sphere_points": 10**6}}}, 422, "sphere_points"),

@@ -124,7 +124,7 @@ def test_a_robot_may_say_itself_what_it_reaches(begun):
         assert told["waypoints"] == []
         costs = [session.next([T], [length]).decision.cost for T, length in zip(poses, lengths, strict=True)]
         assert np.allclose(np.array(costs) / costs[0], lengths)
-        with pytest.raises(PlanningError, match="no view is left"):
+        with pytest.raises(PlanningError, match="no candidate views left"):
             session.next([])
         for wrong in ([1.0], [1.0, 2.0, -0.5]):
             with pytest.raises(InputError, match="path_length"):
@@ -420,7 +420,7 @@ BROKEN = {
     "whole numbers for metres": (given(depth=npy(np.ones((120, 160), int))), "floats in metres"),
     "endless depth": (given(depth=npy(np.full((120, 160), np.inf))), "infinite"),
     "labels of another size": (given(labels=png(np.ones((60, 80), np.uint16))), "labels is 80×60, depth is"),
-    "labels that are no numbers": (given(labels=npy(np.full((120, 160), 0.5))), "whole numbers"),
+    "labels that are no numbers": (given(labels=npy(np.full((120, 160), 0.5))), "not integers"),
     "rgb of floats": (given(rgb=npy(np.ones((120, 160, 3)))), "uint8"),
     "normals that are no array": (given(normals=BOMB), "not a valid .npy"),
     "an image too large to decode": (given(depth=BOMB), "16000000"),
@@ -512,7 +512,7 @@ def test_a_session_is_not_begun_where_something_is(begun, tmp_path):
     with FileLock(tmp_path / "soon/lock"), pytest.raises(SessionBusyError):
         Session.begin(tmp_path / "soon")
     assert not (tmp_path / "soon/session.json").exists()
-    with pytest.raises(InputError, match="no planner 'juggler'"):
+    with pytest.raises(InputError, match="unknown planner 'juggler'"):
         Session.begin(tmp_path / "new", planner="juggler")
     assert not (tmp_path / "new").exists()
 

@@ -207,7 +207,7 @@ def test_what_is_said_of_an_object(step, settings):
     doubtful = with_supports(step, Support("o1", "o2", certain=False)).graph
     said = "o1 → o2</dt><dd>bottom-up, probability 0.50, uncertain, 1 of 1"
     assert said in describe_object(doubtful, "o1", config)
-    assert "not known" in describe_object(graph, "o9", config)
+    assert "not found" in describe_object(graph, "o9", config)
     assert "was removed" in describe_object(graph, "o9", config, taken=True)
     assert "View 1 of 3" in describe_view(step, None, 3)
     assert "finished</dt><dd>enough" in describe_view(replace(step, stop="enough"), None, 1)
@@ -298,7 +298,7 @@ def test_earlier_views_keep_few_points_and_their_cameras_are_not_sent_again(step
 
 def test_a_recording_ends_with_its_views(recording, settings):
     page = LoopPage(partial(open_source, str(recording), noise="none", segmentation=None, seed=0), settings)
-    assert "no view is left" in [page.turn() for _ in range(4)][-1]
+    assert "no candidate views left" in [page.turn() for _ in range(4)][-1]
     page.close()
     assert [step.robot for step in page.steps] == [None] * 3
 
