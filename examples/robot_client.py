@@ -38,7 +38,7 @@ class RobotClient:
             self.headers["Authorization"] = f"Bearer {token}"
 
     def begin(self, name: str, **options: Any) -> dict[str, Any]:
-        """Begin a session; options: segmentation, seed, planner, settings."""
+        """Create a session; options: segmentation, seed, planner, settings."""
         return self._ask("POST", "/sessions", {"name": name, **options})
 
     def add(
@@ -64,7 +64,7 @@ class RobotClient:
         return self._ask("POST", f"/sessions/{name}/views", view)
 
     def next(self, name: str, candidates: list[Matrix] | None = None) -> dict[str, Any]:
-        """Where to look next, of what the humanoid of the settings reaches, or of these camera poses."""
+        """Return the next best view for the humanoid of the settings, or among these camera poses."""
         if candidates is None:
             return self._ask("GET", f"/sessions/{name}/next")
         return self._ask("POST", f"/sessions/{name}/next", {"T_world_camera": candidates})

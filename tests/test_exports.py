@@ -224,7 +224,7 @@ def test_too_many_objects_are_refused_before_they_are_read(tmp_path, graph, caps
     [
         (["--out", "model.step"], "the suffix is not that of any format"),
         (["--format", "mjcf", "--out", "graph.json"], "the suffix is not that of mjcf"),
-        (["--out", "folder.urdf"], "is a folder"),
+        (["--out", "folder.urdf"], "is a directory"),
     ],
 )
 def test_a_file_that_is_no_export_is_never_touched(tmp_path, kept_run, monkeypatch, capsys, arguments, said):
@@ -246,9 +246,9 @@ def test_what_cannot_be_exported_is_said(tmp_path, graph, capsys):
     with pytest.raises(InputError, match="has no objects"):
         export_graph(SupportGraph(), tmp_path / "s.glb")
     named = replace(graph, objects=(replace(graph.objects[1], id="world"),), supports=())
-    with pytest.raises(InputError, match="called 'world'"):
+    with pytest.raises(InputError, match="named 'world'"):
         export_graph(named, tmp_path / "s.urdf")
     twice = replace(graph, objects=(graph.objects[0], replace(graph.objects[1], id="table")), supports=())
-    with pytest.raises(InputError, match="MuJoCo does not take it"):
+    with pytest.raises(InputError, match="MuJoCo rejects it"):
         export_graph(twice, tmp_path / "s.xml")
     assert list(tmp_path.iterdir()) == []

@@ -541,7 +541,7 @@ class TestHiddenSurface:
             chosen = OPEN.directions[decision.index]
             assert degrees_between(visited, chosen).min() > 15.0
             assert turn or chosen @ HOME < 0.5
-            assert turn or decision.why == "shows the most hidden surface: o1 (100%)"
+            assert turn or decision.why == "expected to reveal the most: o1 (100%)"
             visited = np.vstack([visited, chosen])
 
     def test_it_takes_the_look_that_shows_most_anew_at_little_cost_and_says_what(self, worked_out):
@@ -559,7 +559,7 @@ class TestHiddenSurface:
         assert decision.cost == pytest.approx(cost[best])
         shares = sorted(((gain[best] / total[best], name) for name, gain in worth.items()), reverse=True)
         said = ", ".join(f"{name} ({share:.0%})" for share, name in shares[:3] if share > 0.05)
-        assert decision.why == f"shows the most hidden surface: {said}"
+        assert decision.why == f"expected to reveal the most: {said}"
 
     def test_the_middles_of_what_is_hidden_are_points_of_interest(self, worked_out):
         decision, config, gains, relations = worked_out

@@ -133,4 +133,4 @@ def _why(samples: Samples, gain: Array) -> str:
         worth[name] = worth.get(name, 0.0) + float(share)
     ranked = sorted(worth.items(), key=lambda item: -item[1])[:3]
     parts = [f"{name} ({share / total:.0%})" for name, share in ranked if share > WORTH_SAYING * total]
-    return "shows the most hidden surface: " + ", ".join(parts)
+    return "expected to reveal the most: " + ", ".join(parts)
