@@ -215,7 +215,7 @@ def test_the_demo_says_view_by_view_what_it_found(tmp_path, capsys):
     assert conditions == "tower: masks: simulator, noise: carmine"
     assert re.fullmatch(r"view 1: \d objects, \d supports.*, F1 \d\.\d{3} \(\d+\.\d s\)", lines[0])
     assert lines[1].startswith("  found: o1 (")
-    assert " held by " in lines[1]
+    assert " supported by " in lines[1]
     assert lines[2].startswith("  next view: ")
     assert any(line.startswith("view 2: ") for line in lines)
     assert "  done: maximum of 2 views reached" in lines

@@ -80,7 +80,7 @@ def test_a_clearing_that_is_killed_goes_on(tmp_path):
     assert run_command(*words, "--out", tmp_path / "whole", "--quiet") == 0
     whole, folder = read_run(tmp_path / "whole"), tmp_path / "runs" / "run"
     folder.parent.mkdir()
-    for kills, moment in enumerate(["view 1:", "took", "took", "took"]):
+    for kills, moment in enumerate(["view 1:", "removed", "removed", "removed"]):
         command = Command(*words, "--out", folder)
         command.wait_for(moment)
         kept = read_run(folder)

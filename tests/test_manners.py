@@ -231,6 +231,31 @@ def test_sigterm_ends_a_command_in_one_line(command, words):
     assert said.count("\n") == (process.returncode == 130)
 
 
+def test_an_interrupt_in_a_callback_is_not_lost():
+    """Python drops what a weak reference's callback raises, and so a signal that comes while one runs."""
+    program = """
+import os, signal, time, weakref
+import caryatid.cli as cli
+
+class Thing: pass
+
+def main():
+    thing = Thing()
+    watch = weakref.ref(thing, lambda _: os.kill(os.getpid(), signal.SIGTERM) or [n for n in range(9)])
+    try:
+        del thing
+        time.sleep(30)
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+cli.main = main
+cli.run_from_shell()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], stderr=subprocess.PIPE, text=True, timeout=60)
+    assert (ended.returncode, ended.stderr) == (130, "")
+
+
 # Colours, and what moves
 
 

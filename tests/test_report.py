@@ -279,7 +279,7 @@ def test_any_step_is_drawn(make_step):
     first, second, _ = (section for section in report.sections if section.title.startswith("View"))
     assert len(first.figures) == 3
     assert "depth image" in first.figures[0].caption
-    assert [figure.heading[:9] for figure in second.figures] == ["What supp", "The fused"]
+    assert [figure.heading[:9] for figure in second.figures] == ["Support g", "Fused clo"]
     assert render_pdf(make_report("t", [nothing]))
 
 

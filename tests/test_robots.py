@@ -298,7 +298,7 @@ class TestCommandLine:
     def test_a_recording_has_no_robot(self, kept_recording, tmp_path, capsys):
         arm = ["--robot", "test_robots:make_arm", "--views=2", "--no-report", "--quiet"]
         assert run_command("explore", kept_recording, "--out", tmp_path / "run", *arm) == 1
-        assert "is a recording" in capsys.readouterr().err
+        assert "a recording has no robot" in capsys.readouterr().err
 
     def test_a_session_keeps_its_arm(self, map_file, views, tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(map_file.parent)

@@ -68,6 +68,14 @@ def _interrupted(error: BaseException | None) -> bool:
     return error is not None
 
 
+def _interrupt_again(lost: sys.UnraisableHookArgs) -> None:
+    """Repeat an interrupt that a callback or finaliser lost, once that has returned."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        signal.setitimer(signal.ITIMER_REAL, 0.01)
+    else:
+        sys.__unraisablehook__(lost)
+
+
 def run_from_shell() -> NoReturn:
     """Run the command line and exit with its status.
 
@@ -81,6 +89,9 @@ def run_from_shell() -> NoReturn:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, signal.default_int_handler)
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, signal.default_int_handler)
+        sys.unraisablehook = _interrupt_again
     status = main()
     if status == INTERRUPTED:
         # Do not make the user wait for threads and libraries to end.
