@@ -69,8 +69,8 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     info_topic = bag.require("--info", options.info, "cameras")
     rgb_topic = None if options.rgb is None else bag.require("--rgb", options.rgb, "images")
     cameras, distorts = _read_cameras(bag, info_topic)
-    depths = bag.images(depth_topic, partial(_depth, max_pixels=config.max_pixels))
-    colour = partial(_colour, max_pixels=config.max_pixels)
+    depths = bag.images(depth_topic, partial(decode_depth, max_pixels=config.max_pixels))
+    colour = partial(decode_colour, max_pixels=config.max_pixels)
     colours = None if rgb_topic is None else bag.images(rgb_topic, colour)
     pose_at, notes = None, []
     if options.world is None:
@@ -196,9 +196,9 @@ def _stamp(header: Any, received: int) -> int:
     return int(header.stamp.sec * SECOND + header.stamp.nanosec) or received
 
 
-def _depth(message: Any, source: str, max_pixels: int) -> NDArray[np.float32]:
+def decode_depth(message: Any, source: str, max_pixels: int) -> NDArray[np.float32]:
     """Depth (H, W) [m] of an image message, compressed or not; 0 for NaN, infinite or negative values."""
-    if message.__msgtype__ == COMPRESSED:
+    if hasattr(message, "format"):
         depth = _compressed_depth(message, source, max_pixels)
     else:
         kind = _known(message, DEPTH_ENCODINGS, source)
@@ -223,9 +223,9 @@ def _compressed_depth(message: Any, source: str, max_pixels: int) -> NDArray[np.
         return np.where(units > 0, scale / (units - np.float64(offset)), 0.0)
 
 
-def _colour(message: Any, source: str, max_pixels: int) -> NDArray[np.uint8]:
+def decode_colour(message: Any, source: str, max_pixels: int) -> NDArray[np.uint8]:
     """Colour (H, W, 3) of an image message, compressed or not; grey images have three equal channels."""
-    if message.__msgtype__ == COMPRESSED:
+    if hasattr(message, "format"):
         return images.decode_image(message.data.tobytes(), source, max_pixels=max_pixels)
     count, channels = _known(message, COLOUR_ENCODINGS, source)
     return np.ascontiguousarray(_pixels(message, "u1", count, source)[:, :, channels])
