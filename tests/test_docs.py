@@ -12,7 +12,6 @@ import shutil
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -240,23 +239,6 @@ def test_the_errors_the_questions_quote_are_what_the_code_says():
         for text in reversed(texts):
             left = left.replace(text, "")
         assert len(left) < 0.7 * len(line), line
-
-
-def test_a_message_of_ros_becomes_a_view_as_the_page_does_it(workplace, views):
-    (text,) = [text for language, text in runs(DOCS / "robot.md") if "def view_of" in text]
-    names: dict = {}
-    exec(compile(text, "robot.md", "exec"), names)
-    image = np.round(1e3 * views[0].depth).astype("<u2")
-    rows = np.pad(image, ((0, 0), (0, 3)))  # drivers may pad rows
-    depth = SimpleNamespace(
-        encoding="16UC1", height=image.shape[0], width=image.shape[1], data=rows.tobytes()
-    )
-    still = SimpleNamespace(
-        rotation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0), translation=SimpleNamespace(x=1.0, y=2.0, z=3.0)
-    )
-    view = names["view_of"](depth, SimpleNamespace(k=views[0].K.ravel()), still)
-    np.testing.assert_allclose(view.depth, views[0].depth, atol=6e-4)
-    np.testing.assert_allclose(view.pose[:3, 3], (1.0, 2.0, 3.0))
 
 
 # The front door

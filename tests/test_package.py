@@ -63,7 +63,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(built):
 
 def test_the_sdist_holds_tests_docs_and_what_the_tests_read(built):
     names = {name.partition("/")[2] for name in built[1].getnames()}
-    for folder in ("src", "tests", "examples", "benchmarks", "tools"):
+    for folder in ("src", "tests", "examples", "benchmarks", "ros", "tools"):
         assert sources(folder) <= names
     files = ("README.md", "CHANGELOG.md", "CITATION.cff", "LICENSE", "Makefile", "constraints.txt")
     assert {*files, "docs/method.md", "pyproject.toml"} <= names

@@ -10,6 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 TEXTS = [
     *(ROOT / "src").rglob("*.py"), *(ROOT / "examples").rglob("*.py"),
+    *(ROOT / "ros").rglob("*.*"),
     *(page for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")) if "_build" not in page.parts),
     *(ROOT / ".github").rglob("*.yml"),
 ]  # fmt: skip

@@ -1,0 +1,119 @@
+"""Leaves of a py_trees behaviour tree, one for each verb: `Explore`, `order` and `removed`.
+
+They take the clients of an rclpy node, which must spin while the tree ticks, and call them asynchronously.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from py_trees.behaviour import Behaviour
+from py_trees.common import Status
+
+from caryatid_ros.messages import Make, make_message
+
+SUCCEEDED = 4
+"""Status of a goal that succeeded, in action_msgs/GoalStatus."""
+
+
+class Explore(Behaviour):
+    """Explore; succeeds when no further view is worth its path. An interruption cancels the goal.
+
+    Args:
+        client: `rclpy.action.ActionClient` of `explore`.
+        go_to: Called with each Decision; starts the camera's motion to `decision.camera`, and returns.
+        make: Makes a message.
+        goal: Fields of the goal, such as `max_views=5`.
+
+    Attributes:
+        result: The newest result, or None.
+    """
+
+    def __init__(
+        self, client: Any, go_to: Callable[[Any], object], *, make: Make = make_message, **goal: Any
+    ) -> None:
+        super().__init__("explore")
+        self._client, self._go_to, self._make, self._goal = client, go_to, make, goal
+        self.result: Any = None
+        self._answer: Any = None
+
+    def initialise(self) -> None:
+        """Send the goal."""
+        self.result, self._answer = None, None
+        goal = self._make("caryatid_msgs/action/Explore/Goal", **self._goal)
+        self._sent = self._client.send_goal_async(goal, feedback_callback=self._decided)
+
+    def _decided(self, message: Any) -> None:
+        self.feedback_message = message.feedback.decision.why
+        self._go_to(message.feedback.decision)
+
+    def update(self) -> Status:
+        """Return whether the goal is running, succeeded or failed."""
+        if not self._sent.done():
+            return Status.RUNNING
+        handle = self._sent.result()
+        if not handle.accepted:
+            self.feedback_message = "the goal was rejected"
+            return Status.FAILURE
+        self._answer = self._answer or handle.get_result_async()
+        if not self._answer.done():
+            return Status.RUNNING
+        answer = self._answer.result()
+        self.result, self.feedback_message = answer.result, answer.result.message
+        return Status.SUCCESS if answer.status == SUCCEEDED else Status.FAILURE
+
+    def terminate(self, new_status: Status) -> None:
+        """Cancel a goal that is interrupted, as soon as it is accepted."""
+        if self.status == Status.RUNNING and new_status == Status.INVALID:
+            self._sent.add_done_callback(lambda sent: sent.result().cancel_goal_async())
+
+
+class Call(Behaviour):
+    """Call a service once.
+
+    Args:
+        name: Name of the leaf.
+        client: Client of the service, from `Node.create_client`.
+        request: Makes the request when the leaf starts.
+        good: Tells by the response whether the leaf succeeds.
+
+    Attributes:
+        response: The newest response, or None.
+    """
+
+    def __init__(
+        self, name: str, client: Any, request: Callable[[], Any], good: Callable[[Any], bool]
+    ) -> None:
+        super().__init__(name)
+        self._client, self._request, self._good = client, request, good
+        self.response: Any = None
+
+    def initialise(self) -> None:
+        """Send the request."""
+        self.response = None
+        self._sent = self._client.call_async(self._request())
+
+    def update(self) -> Status:
+        """Return whether the response is outstanding, good or bad."""
+        if not self._sent.done():
+            return Status.RUNNING
+        self.response = self._sent.result()
+        self.feedback_message = self.response.message
+        return Status.SUCCESS if self._good(self.response) else Status.FAILURE
+
+
+def order(client: Any, *, make: Make = make_message, **request: Any) -> Call:
+    """Plan a removal order, such as with `hands=1`; the leaf succeeds if every lift of it is safe."""
+    return Call(
+        "order", client, lambda: make("caryatid_msgs/srv/Order/Request", **request),
+        lambda response: response.success and response.safe,
+    )  # fmt: skip
+
+
+def removed(client: Any, which: Callable[[], str], *, make: Make = make_message) -> Call:
+    """Report that an object was removed; `which` returns its id when the leaf starts."""
+    return Call(
+        "removed", client, lambda: make("caryatid_msgs/srv/Removed/Request", object=which()),
+        lambda response: response.success,
+    )  # fmt: skip

@@ -1,0 +1,187 @@
+"""Conversion between ROS messages and caryatid's own data; rclpy is not needed.
+
+Messages are made by a function `make(name, **fields)`, so that other message types with the same fields work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import reduce
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from caryatid.config import RecordingConfig
+from caryatid.errors import InputError
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Shape
+from caryatid.geometry.transforms import Array
+from caryatid.graph import SceneObject, Support, SupportGraph
+from caryatid.io.bags import decode_colour, decode_depth
+from caryatid.manipulation.order import Order
+from caryatid.planning.decision import Decision
+from caryatid.sensing.views import View
+from caryatid.viz.colours import object_colour, rgb
+
+Make = Callable[..., Any]
+"""Makes a message: `make("geometry_msgs/msg/Point", x=1.0)`; other fields keep their defaults."""
+
+CUBE, SPHERE, CYLINDER, ARROW, TEXT, TRIANGLES, DELETE_ALL = 1, 2, 3, 0, 9, 11, 3
+"""Types of visualization_msgs/Marker, and its action that deletes all markers."""
+SHAPES = {"box": CUBE, "sphere": SPHERE, "cylinder": CYLINDER}
+"""Kinds of shapes that RViz draws itself; others are drawn as triangles."""
+TEXT_HEIGHT, ARROW_WIDTH = 0.025, 0.012
+"""Height of names, and width of the arrow of a certain support [m]."""
+
+
+def make_message(name: str, **fields: Any) -> Any:
+    """Make a message of an installed ROS package, such as `caryatid_msgs/srv/Order/Request`."""
+    package, kind, *names = name.split("/")
+    found: Any = reduce(getattr, names, import_module(f"{package}.{kind}"))
+    return found(**fields)
+
+
+def seconds_of(stamp: Any) -> float:
+    """Time [s] of a builtin_interfaces/Time."""
+    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+
+
+def matrix_of(rotation: Any, translation: Any, name: str) -> Array:
+    """A pose or transform as a matrix (4, 4), from its quaternion and its translation [m].
+
+    Raises:
+        InputError: The quaternion is zero, or a number is not finite.
+    """
+    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
+    if not np.linalg.norm((x, y, z, w)) > 1e-6:
+        raise InputError(name, "has no rotation: its quaternion is zero or NaN", "give a unit quaternion")
+    R = Rotation.from_quat((x, y, z, w)).as_matrix()
+    return transforms.as_rigid(transforms.rigid(R, (translation.x, translation.y, translation.z)), name)
+
+
+def view_of(depth: Any, info: Any, colour: Any, T_world_camera: Array) -> View:
+    """The view of a depth image, its camera, and a colour image of the same size.
+
+    Args:
+        depth: sensor_msgs/Image or CompressedImage.
+        info: sensor_msgs/CameraInfo of the depth image.
+        colour: sensor_msgs/Image or CompressedImage, or None.
+        T_world_camera: Pose (4, 4) of the image's optical frame.
+
+    Raises:
+        InputError: An encoding is unknown, data is missing, or sizes differ.
+    """
+    pixels = RecordingConfig().max_pixels
+    metres = decode_depth(depth, "depth image", pixels)
+    if (info.height, info.width) != metres.shape:
+        height, width = metres.shape
+        reason = f"is for {info.width} × {info.height} pixels, the depth image has {width} × {height}"
+        raise InputError("camera info", reason, "use the camera info of the aligned depth image")
+    image = None if colour is None else decode_colour(colour, "colour image", pixels)
+    name = f"{seconds_of(depth.header.stamp):.3f}"
+    return View(metres, np.reshape(info.k, (3, 3)), T_world_camera, image, name=name)
+
+
+def pose_message(make: Make, T: Array) -> Any:
+    """A geometry_msgs/Pose of a matrix (4, 4)."""
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+    orientation = make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    return make("geometry_msgs/msg/Pose", position=_point(make, T[:3, 3]), orientation=orientation)
+
+
+def graph_message(make: Make, graph: SupportGraph, header: Any) -> Any:
+    """A SupportGraph, with the time of the newest image and the world frame in its header."""
+    objects = [_object(make, o) for o in graph.objects]
+    supports = [_support(make, s) for s in graph.supports]
+    return make("caryatid_msgs/msg/SupportGraph", header=header, objects=objects, supports=supports)
+
+
+def _object(make: Make, o: SceneObject) -> Any:
+    return make(
+        "caryatid_msgs/msg/Object",
+        id=o.id, label=int(o.label), role=o.role, shape=o.shape.kind, occurrences=int(o.occurrences),
+        pose=pose_message(make, o.shape.T_world_object), extents=_vector(make, o.shape.extents),
+        probability=float("nan") if o.probability is None else float(o.probability), doubt=o.doubt,
+    )  # fmt: skip
+
+
+def _support(make: Make, s: Support) -> Any:
+    return make(
+        "caryatid_msgs/msg/Support",
+        supporter=s.supporter, supported=s.supported, kind=s.kind, probability=float(s.belief),
+        occurrences=int(s.occurrences), opportunities=int(s.opportunities), why=s.why,
+        contact=_point(make, np.full(3, np.nan) if s.contact_world is None else s.contact_world),
+    )  # fmt: skip
+
+
+def decision_message(make: Make, decision: Decision, header: Any) -> Any:
+    """A Decision, with the next camera pose in the frame of the header."""
+    pose = pose_message(make, decision.T_world_camera)
+    return make(
+        "caryatid_msgs/msg/Decision",
+        camera=make("geometry_msgs/msg/PoseStamped", header=header, pose=pose), why=decision.why,
+        expected_gain=float(decision.saliency), cost=float(decision.cost), score=float(decision.score),
+    )  # fmt: skip
+
+
+def lift_messages(make: Make, order: Order) -> list[Any]:
+    """A Lift for each step of a removal order."""
+    return [
+        make(
+            "caryatid_msgs/msg/Lift",
+            object=s.object_id, hold=list(s.hold), risk=float(s.risk), safe=bool(s.safe), why=s.why,
+        )
+        for s in order.steps
+    ]  # fmt: skip
+
+
+def markers_message(make: Make, graph: SupportGraph, header: Any) -> Any:
+    """A MarkerArray: shapes in the report's colours, their ids, and an arrow for each support.
+
+    The more probable a support is, the wider is its arrow.
+    """
+
+    def marker(ns: str, kind: int, colour: str, alpha: float, **fields: Any) -> None:
+        red, green, blue = (channel / 255.0 for channel in rgb(colour))
+        rgba = make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha)
+        fields = {"header": header, "ns": ns, "id": len(found), "type": kind, "color": rgba, **fields}
+        found.append(make("visualization_msgs/msg/Marker", **fields))
+
+    found = [make("visualization_msgs/msg/Marker", header=header, action=DELETE_ALL)]
+    for o in graph.objects:
+        kind, colour = SHAPES.get(o.shape.kind, TRIANGLES), object_colour(o.label)
+        drawn = {"pose": pose_message(make, o.shape.T_world_object)}
+        if kind == TRIANGLES:
+            corners = o.shape.mesh().triangles.reshape(-1, 3)
+            drawn |= {"scale": _vector(make, np.ones(3)), "points": [_point(make, p) for p in corners]}
+        else:
+            drawn["scale"] = _vector(make, o.shape.extents)
+        marker("shapes", kind, colour, 0.8, **drawn)
+        above = transforms.rigid(np.eye(3), o.centre_world + (0.0, 0.0, _half_height(o.shape) + TEXT_HEIGHT))
+        size = _vector(make, (0.0, 0.0, TEXT_HEIGHT))
+        marker("ids", TEXT, "#ffffff", 1.0, pose=pose_message(make, above), scale=size, text=o.id)
+    for s in graph.supports:
+        end = graph[s.supported].centre_world
+        start = graph[s.supporter].centre_world
+        if graph[s.supporter].role == "support_surface":  # straight up, not from the middle of the table
+            start = np.array([*end[:2], start[2]])
+        width = ARROW_WIDTH * max(s.belief, 0.1)
+        points, scale = [_point(make, start), _point(make, end)], _vector(make, (width, 2.5 * width, 0.0))
+        marker("supports", ARROW, "#202020", 1.0, points=points, scale=scale)
+    return make("visualization_msgs/msg/MarkerArray", markers=found)
+
+
+def _half_height(shape: Shape) -> float:
+    return float(shape.support(np.array([[0.0, 0.0, 1.0]]))[0])
+
+
+def _point(make: Make, xyz: Array | tuple[float, ...]) -> Any:
+    x, y, z = map(float, xyz)
+    return make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+
+
+def _vector(make: Make, xyz: Array | tuple[float, ...]) -> Any:
+    x, y, z = map(float, xyz)
+    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
