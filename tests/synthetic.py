@@ -13,6 +13,7 @@ from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sph
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph
 from caryatid.scene import Scene
+from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.clouds import oriented_points
 from caryatid.sensing.view_sphere import direction
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
@@ -59,6 +60,15 @@ def thing(label: int, shape: Shape, **fields) -> SceneObject:
 def table_object(top: float = TABLE_TOP) -> SceneObject:
     shape = box((0.0, 0.0, top - 0.02), (0.7, 1.0, 0.04))
     return SceneObject(SUPPORT_SURFACE_ID, SUPPORT_LABEL, shape, "support_surface")
+
+
+def surface_at(height: float = TABLE_TOP) -> SupportSurface:
+    """A table top of 0.7 m × 1 m."""
+    corners = np.array(
+        [[-0.35, -0.5, height], [0.35, -0.5, height], [0.35, 0.5, height], [-0.35, 0.5, height]]
+    )
+    top = box((0.0, 0.0, height - 0.02), (0.7, 1.0, 0.04))
+    return SupportSurface(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, height]), corners, top)
 
 
 def random_motion(rng: np.random.Generator, reach: float = 1.0) -> Array:

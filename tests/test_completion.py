@@ -2,13 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from synthetic import TABLE_TOP, box, cylinder, hausdorff, seen_free, sphere, thing
+from synthetic import TABLE_TOP, box, cylinder, hausdorff, seen_free, sphere, surface_at, thing
 
 from caryatid.config import CompletionConfig, VoxelConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder
 from caryatid.objects.hidden_extents import complete
-from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.voxel_map import VoxelMap
 
 CONFIG = CompletionConfig()
@@ -16,14 +15,6 @@ SIDES_AND_TOP = (True, True, True, True, False, True)
 """All but the lower side of an upright shape."""
 CENTRE = (0.0, 0.0, TABLE_TOP)
 UNKNOWN = VoxelMap.around(CENTRE, VoxelConfig())
-
-
-def surface_at(height=TABLE_TOP):
-    corners = np.array(
-        [[-0.35, -0.5, height], [0.35, -0.5, height], [0.35, 0.5, height], [-0.35, 0.5, height]]
-    )
-    top = box((0.0, 0.0, height - 0.02), (0.7, 1.0, 0.04))
-    return SupportSurface(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, height]), corners, top)
 
 
 def completed(*objects, voxels=UNKNOWN, surface=None):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from synthetic import box, cylinder, sphere, surface_points
+from synthetic import box, cylinder, sphere, surface_at, surface_points
 
 from caryatid.config import Config
 from caryatid.fitting.primitives import FitFailure
@@ -86,7 +86,19 @@ def test_a_shape_that_another_object_would_fill_is_not_taken(models, plated, kin
     shown = shown if plated else np.where(shown == 2, 0, shown)
     models.fit_all(models.add(observation.with_labels(shown.astype(np.int32)), 0))
     assert models.objects()[0].shape.kind == "sphere"
-    models.form({1, 2}, VoxelMap.around(np.array([0.0, 0.0, 0.75]), Config().voxels))
+    models.form({1, 2}, VoxelMap.around(np.array([0.0, 0.0, 0.75]), Config().voxels), np.empty((0, 3)))
+    assert models.objects()[0].shape.kind == kind
+
+
+@pytest.mark.parametrize(("table", "kind"), [(0.81, "solid"), (0.75, "sphere")])
+def test_a_shape_that_the_table_would_fill_is_not_taken(models, table, kind):
+    """The upper half of a ball, seen alone, is a dome where it stands on a table, and a ball above one."""
+    observation = observation_of((1,), (sphere((0.0, 0.0, 0.83), 0.08),), eye=(-0.9, -0.6, 1.8))
+    shown = np.where(observation.cloud.points_world[:, 2] > 0.83, 1, 0).astype(np.int32)
+    observation = observation.with_labels(shown)
+    models.fit_all(models.add(observation, 0))
+    feet = observation.beneath(surface_at(table), Config().explanation.spacing)
+    models.form({1}, VoxelMap.around(np.array([0.0, 0.0, 0.75]), Config().voxels), feet)
     assert models.objects()[0].shape.kind == kind
 
 

@@ -225,7 +225,7 @@ SCENES = {
 def test_the_network_tells_two_boxes_apart_and_each_from_the_table():
     view = table_scene(FRONT, [HALF, solid(0.1, 0.05, 0.06, 0.13, 0.1)], sigma=0.001)
     grid, K_grid = np.s_[::2, ::2], K / np.array([[2.0], [2.0], [1.0]])
-    odds = affinities(view.depth[grid], K_grid, UP @ FRONT[:3, :3], FRONT[2, 3] - TABLE)
+    odds = affinities(view.depth[grid], None, K_grid, UP @ FRONT[:3, :3], FRONT[2, 3] - TABLE)
     labels = view.labels[grid]
     for right, expected in ((12, True), (32, False)):  # within a box, and across the 7 cm between them
         first, other, same = (

@@ -22,7 +22,7 @@ from caryatid.geometry.transforms import rigid
 from caryatid.graph import SceneObject, Support
 from caryatid.support.contacts import find_contacts, find_gap
 from caryatid.support.plausibility import closing, drawn, reconcile
-from caryatid.support.relations import explain, infer, predict_removal
+from caryatid.support.relations import RULES, explain, infer, predict_removal
 from caryatid.support.stability import (
     assess,
     beneath,
@@ -375,7 +375,7 @@ class TestInfer:
         assert held["o3", "o1"] == "lean"
         assert ("o2", "o1") not in held
 
-    @pytest.mark.parametrize("gap", [0.0, 0.004, 0.01])
+    @pytest.mark.parametrize("gap", [0.0, 0.004, 0.008])
     def test_a_plank_leans(self, gap):
         graph = infer(leaning_plank(gap), CONFIG)
         assert edges(graph) == {
@@ -523,7 +523,9 @@ class TestProbabilities:
         """
         many = replace(CONFIG, draws=300)
         heavy = 0.24 / (0.24 + 0.76 * many.unexplained)
-        assert self.likely(counterweight(), many)["o3", "o2"] == pytest.approx((1.0 + heavy) / 2.0, abs=0.06)
+        assert self.likely(counterweight(), many)["o3", "o2"] == pytest.approx(
+            RULES + (1.0 - RULES) * heavy, abs=0.06
+        )
 
     def test_a_contact_that_would_open_by_the_uncertainty_is_less_likely(self):
         """A slab that one block carries alone lies 3 mm over a second one: it may rest on that, or not."""
@@ -533,9 +535,9 @@ class TestProbabilities:
             first = thing(1, (0, 0, 0.05), known, (0.16, 0.2, 0.1))
             second = thing(2, (0.12, 0, 0.0485), known, (0.06, 0.2, 0.097))
             slab = thing(3, (0.05, 0, 0.11), known, (0.24, 0.1, 0.02))
-            return self.likely([SURFACE, first, second, slab], replace(CONFIG, draws=60))["o2", "o3"]
+            return self.likely([SURFACE, first, second, slab], replace(CONFIG, draws=60)).get(("o2", "o3"))
 
-        assert shown(0.0002) == pytest.approx(0.5, abs=0.01)
+        assert shown(0.0002) is None
         assert 0.55 < shown(0.003) < 0.98
 
     def test_an_object_whose_size_is_a_guess_is_less_likely_the_one_it_is_taken_for(self):

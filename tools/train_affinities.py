@@ -1,11 +1,12 @@
 """Train the network of automatic segmentation on simulated tables.
 
-python tools/train_affinities.py scenes FOLDER [--count N] [--seed S]    render N scenes, 12 views each
-python tools/train_affinities.py train FOLDER [--minutes M] [--out FILE]    needs torch and onnx
+python tools/train_affinities.py scenes FOLDER [--count N] [--seed S]    render N scenes, 8 views each
+python tools/train_affinities.py train FOLDER [--minutes M] [--start FILE] [--out FILE]   needs torch, onnx
 
 Scenes hold random objects of one to a dozen convex parts: tools, bottles, mugs, bowls, toys, boxes. They fall
-onto a table, onto or into a larger object, or stand in rows. Images are noise-free; each training crop gets
-noise, gaps and mixed pixels of its own. 1,800 such scenes and two hours on two cores are enough.
+onto a table, onto or into a larger object, or stand in rows. They are plain, printed or painted part by part.
+Images are noise-free; each training crop gets noise, gaps, mixed pixels and colours of its own. 1,800 such
+scenes and two hours on two cores are enough; `--start` goes on from an earlier network.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ Rng = np.random.Generator
 Part = dict[str, Any]
 Maker = Callable[[Rng], list[Part]]
 GEOM = mujoco.mjtGeom
-WIDTH, HEIGHT, VIEWS = 320, 240, 12
-CROP, BATCH = 192, 16
+WIDTH, HEIGHT, VIEWS = 320, 240, 8
+CROP, BATCH, CHANNELS = 192, 16, 11
 
 
 # Objects, made of parts around the origin [m]
@@ -260,11 +261,12 @@ def bodies(rng: Rng) -> Iterator[tuple[list[Part], float, Array, Rotation]]:
     elif 0.65 <= kind < 0.73:
         count, half = int(rng.integers(2, 11)), rng.uniform((0.02, 0.02, 0.02), (0.05, 0.06, 0.06))
         row, gap = [count, (count + 1) // 2, 4][int(rng.integers(3))], rng.uniform(0.0005, 0.015)
+        flat = rng.random() < 0.4  # one layer, as on a pallet
         for k in range(count):
             layer, column = divmod(k, row)
             x = (column - row / 2.0 + 0.5 * (layer % 2)) * (2.0 * half[0] + gap)
-            at = np.array([x, 0.0, half[2] + layer * (2.0 * half[2] + 0.001)])
-            yield [block(half)], 1.0, at, Rotation.identity()
+            y, z = (layer * (2.0 * half[1] + gap), 0.0) if flat else (0.0, layer * (2.0 * half[2] + 0.001))
+            yield [block(half)], 1.0, np.array([x, y, half[2] + z]), Rotation.identity()
         return
     for k in range(count):
         parts = same if same and rng.random() < 0.9 else drawn(rng, makers)
@@ -322,8 +324,105 @@ def settled(rng: Rng) -> tuple[Any, Any, NDArray[np.int32]]:
     return model, data, labels.astype(np.int32)
 
 
-def rendered(model: Any, data: Any, labels: NDArray[np.int32], rng: Rng) -> dict[str, Any]:
-    """One view: 1/z, labels and cosine of incidence (H, W), focal length, and the camera's pose."""
+# Colours
+
+
+def palette(rng: Rng, count: int) -> Array:
+    """Random colours (N, 3) from 0 to 1, many of them pale or dark."""
+    colours = rng.random((count, 3)) ** rng.uniform(0.5, 2.0)
+    grey = colours.mean(axis=1, keepdims=True)
+    return grey + (colours - grey) * rng.uniform(0.0, 1.0, (count, 1))
+
+
+def painted(rng: Rng, geoms: Sequence[int], model: Any) -> Callable[[Array, Array], Array]:
+    """How an object looks: colours (N, 3) at points (N, 3) of its own frame, on geoms (N,)."""
+    kind, reach = rng.random(), rng.uniform(0.02, 0.12)
+    colours = palette(rng, 5)
+    part = np.zeros(model.ngeom, dtype=np.intp)
+    if kind > 0.6:  # part by part
+        part[list(geoms)] = np.minimum(rng.integers(0, 4, len(geoms)), int(rng.integers(1, 4)))
+    prints = []
+    for _ in range(int(rng.integers(1, 7)) if 0.25 < kind < 0.85 else 0):
+        low = rng.uniform(-1.0, 0.6, 3) * reach
+        size = np.where(rng.random(3) < 0.5, 9.0, rng.uniform(0.1, 1.0, 3) * reach)
+        across, finest = rng.normal(size=3), rng.uniform(0.0, 1.0)
+        lines = across / np.linalg.norm(across) / rng.uniform(0.003, 0.02) if finest < 0.4 else None
+        prints.append((low, low + size, lines, int(rng.integers(1, 5))))
+    edge = rng.uniform(0.001, 0.003) if rng.random() < 0.5 else 0.0
+
+    def colour(points: Array, on: Array) -> Array:
+        shown = colours[part[on]]
+        for low, high, lines, number in prints:
+            inside = ((points > low) & (points < high)).all(axis=1)
+            if lines is not None:
+                inside &= np.sin(2.0 * np.pi * (points @ lines)) > 0.2
+            shown[inside] = colours[number]
+        for g in geoms if edge else ():
+            if model.geom_type[g] == GEOM.mjGEOM_BOX:  # edges are dark, or worn
+                own = on == g
+                at = (points[own] - model.geom_pos[g]) @ _matrix(model.geom_quat[g])
+                shown[own] *= np.where((np.abs(at) > model.geom_size[g] - edge).sum(axis=1) > 1, 0.5, 1.0)[
+                    :, None
+                ]
+        return shown
+
+    return colour
+
+
+def _matrix(quat: Array) -> Array:
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, quat)
+    return R.reshape(3, 3)
+
+
+def ground(rng: Rng) -> Callable[[Array, Array], Array]:
+    """How a table looks: plain, in boards, checked or mottled."""
+    colours, kind = palette(rng, 2), int(rng.integers(4))
+    colours, mixed = 0.6 * colours + 0.4 * colours.mean(), rng.uniform(0.1, 1.0)
+    turn, size = Rotation.from_euler("z", rng.uniform(0.0, np.pi)).as_matrix(), rng.uniform(0.02, 0.2)
+    phase = rng.uniform(0.0, 6.0, (6, 3))
+    waves = rng.normal(size=(6, 3)) / size * rng.uniform(0.3, 3.0, (6, 1))
+
+    def colour(points: Array, on: Array) -> Array:
+        at = points @ turn / size
+        share = np.zeros(len(points))
+        if kind == 1:
+            share = 0.5 + 0.5 * np.sin(at[:, 0] * 9.0 + 2.0 * np.sin(at[:, 1]))
+        elif kind == 2:
+            share = np.floor(at[:, :2]).sum(axis=1) % 2.0
+        elif kind == 3:
+            share = 0.5 + 0.2 * np.sin(points @ waves.T + phase[:, 0]).sum(axis=1)
+        return colours[0] + (colours[1] - colours[0]) * (mixed * np.clip(share, 0.0, 1.0))[:, None]
+
+    return colour
+
+
+def coloured(model: Any, data: Any, points: Array, normals: Array, on: Any, paint: Any, rng: Rng) -> Any:
+    """Colours (N, 3) uint8 of points of geoms (N,), lit by one lamp, with its shadows."""
+    albedo = np.full((len(points), 3), 0.5)
+    body = np.where(on >= 0, model.geom_bodyid[on], -1)
+    for number, look in paint.items():
+        own = body == number
+        if own.any():
+            albedo[own] = look((points[own] - data.xpos[number]) @ data.xmat[number].reshape(3, 3), on[own])
+    lamp = np.array([*rng.normal(size=2), rng.uniform(0.8, 3.0)])
+    to_lamp = lamp - points
+    away = np.maximum(np.linalg.norm(to_lamp, axis=1), 1e-6)
+    light = np.clip(np.einsum("ij,ij->i", normals, to_lamp) / away, 0.0, 1.0)
+    hit, gap = np.empty(len(points), dtype=np.int32), np.empty(len(points))
+    everything = hit, gap, None
+    mujoco.mj_multiRay(model, data, lamp, (-to_lamp).ravel(), None, 1, -1, *everything, len(points), 20.0)
+    light *= np.where(gap < 0.99, rng.uniform(0.0, 0.8), 1.0)
+    ambient = rng.uniform(0.25, 0.7) * (0.85 + 0.15 * normals[:, 2])
+    shine = rng.uniform(0.0, 0.4) * light ** rng.uniform(10.0, 60.0)
+    shown = albedo * (ambient + rng.uniform(0.3, 0.8) * light)[:, None] + shine[:, None]
+    return (255.0 * np.clip(shown, 0.0, 1.0)).astype(np.uint8)
+
+
+def rendered(
+    model: Any, data: Any, labels: NDArray[np.int32], paint: dict[int, Any], rng: Rng
+) -> dict[str, Any]:
+    """One view: 1/z, labels, cosine of incidence and colours (H, W), focal length, and the camera's pose."""
     focal = rng.uniform(0.8, 1.3) * (1.0 if rng.random() < 0.6 else 1.6) * WIDTH
     on_table = data.xpos[1:][data.xpos[1:, 2] > -0.03]
     target = np.array([*0.05 * rng.normal(size=2), rng.uniform(0.0, 0.1)])
@@ -350,6 +449,12 @@ def rendered(model: Any, data: Any, labels: NDArray[np.int32], rng: Rng) -> dict
         k: np.minimum(v, np.iinfo(t).max).astype(t).reshape(HEIGHT, WIDTH) for k, (v, t) in images.items()
     }
     shown = np.append(labels, 0)[geoms].astype(np.uint8).reshape(HEIGHT, WIDTH)
+    points, normals = (
+        eye + rays * np.maximum(depth, 0.0)[:, None],
+        normals * -np.sign(np.einsum("ij,ij->i", normals, rays))[:, None],
+    )
+    rgb = coloured(model, data, points, normals, geoms, paint, rng)
+    known["rgb"] = rgb.reshape(HEIGHT, WIDTH, 3)
     return known | {"labels": shown, "focal": focal, "up": np.array([x[2], y[2], z[2]]), "height": eye[2]}
 
 
@@ -357,8 +462,15 @@ def make_scenes(folder: Path, count: int, seed: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(count):
         rng = np.random.default_rng([seed, number])
-        scene = settled(rng)
-        views = [rendered(*scene, rng) for _ in range(VIEWS)]
+        model, data, labels = settled(rng)
+        looks: list[Any] = []
+        paint: dict[int, Any] = {0: ground(rng)}
+        same = rng.random() < 0.15
+        for body in range(1, model.nbody):
+            geoms = np.flatnonzero(model.geom_bodyid == body).tolist()
+            looks.append(looks[0] if same and looks else painted(rng, geoms, model))
+            paint[body] = looks[-1]
+        views = [rendered(model, data, labels, paint, rng) for _ in range(VIEWS)]
         stacked: Any = {key: np.stack([view[key] for view in views]) for key in views[0]}
         np.savez_compressed(folder / f"{seed}-{number}.npz", **stacked)
 
@@ -367,7 +479,7 @@ def make_scenes(folder: Path, count: int, seed: int) -> None:
 
 
 def crop(views: dict[str, Any], rng: Rng) -> tuple[Any, ...] | None:
-    """Noisy depth, labels, K, up and height of a crop around objects; None if a view shows hardly any."""
+    """Noisy depth, colours, labels, K, up and height of a crop around objects; None if it has hardly any."""
     k = int(rng.integers(VIEWS))
     inverse, labels, cosine = (
         views["inverse"][k] / np.float32(20000.0),
@@ -391,15 +503,43 @@ def crop(views: dict[str, Any], rng: Rng) -> tuple[Any, ...] | None:
     # On one surface, planes stay planes; steps stay sharp.
     inverse = np.where(np.abs(smooth - nearest) < 0.02 * nearest, smooth, nearest)
     labels, cosine = taken(labels, 0), taken(cosine, 0)
+    rgb = np.stack([taken(views["rgb"][k][..., c], 1) for c in range(3)], axis=-1)
     focal, up, height = views["focal"][k] * zoom, views["up"][k].copy(), float(views["height"][k])
     cy, cx = (np.array([(HEIGHT - 1) / 2.0, (WIDTH - 1) / 2.0]) - low + 0.5) * zoom - 0.5
     if rng.random() < 0.5:
-        inverse, labels, cosine = (image[:, ::-1] for image in (inverse, labels, cosine))
+        inverse, labels, cosine, rgb = (image[:, ::-1] for image in (inverse, labels, cosine, rgb))
         cx, up[0] = CROP - 1 - cx, -up[0]
     scale = rng.uniform(0.75, 1.35)
     depth = noisy(np.ascontiguousarray(inverse / scale), cosine / 255.0, rng)
+    if rng.random() < 0.25:  # something transparent: readings lie behind it, or nowhere
+        clear = labels == labels[rows_of(labels, rng)]
+        depth = np.where(clear, depth + 0.06 * np.maximum(waves(rng, 8, 40), 0.0), depth)
+        depth = np.where(clear & (waves(rng, 8, 40) > rng.uniform(-0.5, 1.5)), 0.0, depth)
+        depth = depth.astype(np.float32)
     K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
-    return depth, labels, K, up, height * scale + 0.002 * rng.normal()
+    seen = None if rng.random() < 0.2 else photographed(rgb, rng)
+    return depth, seen, labels, K, up, height * scale + 0.002 * rng.normal()
+
+
+def rows_of(labels: Any, rng: Rng) -> tuple[int, int]:
+    """A place of an object, or the middle if there is none."""
+    places = np.argwhere(labels > 0)
+    return tuple(places[int(rng.integers(len(places)))]) if len(places) else (CROP // 2, CROP // 2)
+
+
+def photographed(rgb: Any, rng: Rng) -> Any:
+    """Colours (H, W, 3) uint8 as some camera gives them: toned, noisy, blurred, and off the depth image."""
+    image = (rgb.astype(np.float32) + 1.0) / 256.0
+    image = image ** np.float32(rng.uniform(0.5, 1.8)) * rng.uniform(0.6, 1.4, 3).astype(np.float32)
+    grey = image.mean(axis=-1, keepdims=True)
+    image = grey + (image - grey) * np.float32(rng.uniform(0.0, 1.3) if rng.random() < 0.7 else 1.0)
+    if rng.random() < 0.5:
+        image = ndimage.uniform_filter(image, (3, 3, 1))
+    image = image + np.float32(rng.uniform(0.0, 0.05)) * rng.normal(size=image.shape).astype(np.float32)
+    if rng.random() < 0.6:
+        off = np.round((1.2 if rng.random() < 0.85 else 5.0) * rng.normal(size=2)).astype(int)
+        image = np.roll(image, off, axis=(0, 1))
+    return (255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
 
 
 def noisy(inverse: Any, cosine: Any, rng: Rng) -> Any:
@@ -452,19 +592,18 @@ def waves(rng: Rng, fewest: int, most: int) -> Any:
 
 
 def batches(folder: Path, seed: int) -> Iterator[tuple[Any, Any, Any]]:
-    """Features (B, 8, H, W), labels (B, H, W) and which samples have readings (B, H, W)."""
+    """Features (B, 11, H, W), labels (B, H, W) and which samples have readings (B, H, W)."""
     rng, scenes = np.random.default_rng(seed), dict[Path, dict[str, Any]]()
-    files = sorted(folder.glob("*.npz"))
     while True:
-        crops: list[tuple[Any, ...]] = []
+        files, crops = sorted(folder.glob("*.npz")), list[tuple[Any, ...]]()
         while len(crops) < BATCH:
             file = files[int(rng.integers(len(files)))]
             if file not in scenes:
                 scenes[file] = dict(np.load(file))
             if (found := crop(scenes[file], rng)) is not None:
                 crops.append(found)
-        seen = np.stack([features(depth, K, up, height) for depth, _, K, up, height in crops])
-        yield seen, np.stack([c[1] for c in crops]).astype(np.int64), np.stack([c[0] > 0.0 for c in crops])
+        seen = np.stack([features(depth, rgb, *pose) for depth, rgb, _, *pose in crops])
+        yield seen, np.stack([c[2] for c in crops]).astype(np.int64), np.stack([c[0] > 0.0 for c in crops])
 
 
 def feed(queue: Any, folder: Path, seed: int) -> None:
@@ -472,7 +611,7 @@ def feed(queue: Any, folder: Path, seed: int) -> None:
         queue.put(batch)
 
 
-def train(folder: Path, minutes: float, out: Path) -> None:
+def train(folder: Path, minutes: float, start: Path | None, out: Path) -> None:
     import torch
     import torch.multiprocessing as processes
     from torch import nn
@@ -488,20 +627,25 @@ def train(folder: Path, minutes: float, out: Path) -> None:
 
         def __init__(self, widths: tuple[int, ...] = (32, 48, 64, 96, 128)) -> None:
             super().__init__()
-            self.full = layer(8, 8)
-            self.stem = nn.Sequential(layer(8, widths[0], 2), layer(widths[0], widths[0]))
+            self.full = layer(CHANNELS, 8)
+            self.stem = nn.Sequential(layer(CHANNELS, widths[0], 2), layer(widths[0], widths[0]))
             self.down = nn.ModuleList(nn.Sequential(layer(a, b, 2), layer(b, b)) for a, b in pairwise(widths))
             self.up = nn.ModuleList(nn.Sequential(layer(a + b, a), layer(a, a)) for a, b in pairwise(widths))
             self.last = nn.Sequential(layer(widths[0] // 4 + 8, 16), nn.Conv2d(16, len(OFFSETS) + 1, 1))
 
+        def modules_in_order(self) -> Iterator[Any]:
+            """All layers, in the order in which they run."""
+            for part in (self.full, self.stem, self.down, *reversed(self.up), self.last):
+                yield from part.modules()
+
         def forward(self, x: Any) -> Any:
-            levels = [self.stem(x)]
+            full, levels = self.full(x), [self.stem(x)]
             for down in self.down:
                 levels.append(down(levels[-1]))
             y = levels.pop()
             for up, level in zip(reversed(self.up), reversed(levels), strict=True):
                 y = up(torch.cat([level, functional.interpolate(y, scale_factor=2.0, mode="nearest")], 1))
-            return self.last(torch.cat([functional.pixel_shuffle(y, 2), self.full(x)], 1))
+            return self.last(torch.cat([functional.pixel_shuffle(y, 2), full], 1))
 
     def targets(labels: Any, valid: Any) -> tuple[Any, Any]:
         """What the network should say (B, 13, H, W), and how much each place counts."""
@@ -523,7 +667,25 @@ def train(folder: Path, minutes: float, out: Path) -> None:
 
     torch.manual_seed(0)
     network = Network().to(memory_format=torch.channels_last)
-    steps = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-4)
+    most = 2e-3
+    if start is not None:
+        # Where it is stored, normalisation is part of the weights.
+        network.eval()
+        most = 1e-3
+        weights = map(torch.from_numpy, stored_weights(start))
+        layers = [m for m in network.modules_in_order() if isinstance(m, (nn.Conv2d, nn.BatchNorm2d))]
+        with torch.no_grad():
+            for m in layers:
+                if isinstance(m, nn.Conv2d):
+                    known = next(weights)
+                    m.weight.zero_()[:, : known.shape[1]] = known
+                    if m.bias is None:
+                        bias = next(weights)
+                    else:
+                        m.bias.copy_(next(weights))
+                else:
+                    m.bias.copy_(bias)
+    steps = torch.optim.AdamW(network.parameters(), lr=most, weight_decay=1e-4)
     queue = processes.Queue(6)
     processes.Process(target=feed, args=(queue, folder, 1), daemon=True).start()
     begun, number, usual = time.monotonic(), 0, 0.7
@@ -531,7 +693,7 @@ def train(folder: Path, minutes: float, out: Path) -> None:
         seen, labels, valid = map(torch.from_numpy, queue.get())
         said, counts = targets(labels, valid)
         for group in steps.param_groups:
-            group["lr"] = 2e-3 * min(1.0, (number + 1) / 50) * (0.5 + 0.5 * np.cos(np.pi * part)) + 1e-5
+            group["lr"] = most * min(1.0, (number + 1) / 50) * (0.5 + 0.5 * np.cos(np.pi * part)) + 1e-5
         with torch.autocast("cpu", torch.bfloat16):
             odds = network(seen.contiguous(memory_format=torch.channels_last))
         losses = functional.binary_cross_entropy_with_logits(odds.float(), said, reduction="none")
@@ -545,9 +707,21 @@ def train(folder: Path, minutes: float, out: Path) -> None:
     axes = {name: {2: "H", 3: "W"} for name in ("features", "logits")}
     names: dict[str, Any] = {"input_names": ["features"], "output_names": ["logits"], "dynamic_axes": axes}
     torch.onnx.export(
-        network.eval(), (torch.zeros(1, 8, 256, 320),), out, dynamo=False, opset_version=17, **names
+        network.eval(), (torch.zeros(1, CHANNELS, 256, 320),), out, dynamo=False, opset_version=17, **names
     )
     store_in_half(out)
+
+
+def stored_weights(model: Path) -> Iterator[Any]:
+    """Weights and biases of the convolutions of a stored network, in the order in which they run."""
+    import onnx
+    from onnx import numpy_helper
+
+    graph = onnx.load(model).graph
+    known = {w.name.removesuffix("_half"): numpy_helper.to_array(w) for w in graph.initializer}
+    for node in graph.node:
+        if node.op_type == "Conv":
+            yield from (known[name].astype(np.float32) for name in node.input[1:3])
 
 
 def store_in_half(model: Path) -> None:
@@ -579,12 +753,13 @@ def main() -> None:
     scenes.add_argument("--count", type=int, default=1800)
     scenes.add_argument("--seed", type=int, default=0)
     training.add_argument("--minutes", type=float, default=120.0)
+    training.add_argument("--start", type=Path, help="go on from this network")
     training.add_argument("--out", type=Path, default=Path(MODEL))
     given = parser.parse_args()
     if given.command == "scenes":
         make_scenes(given.folder, given.count, given.seed)
     else:
-        train(given.folder, given.minutes, given.out)
+        train(given.folder, given.minutes, given.start, given.out)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ Kind = Literal["bottom-up", "lean", "top-down"]
 """How a support holds: from below, from the side, or by weight from above."""
 ChangeKind = Literal["removed", "moved", "added"]
 """What happens to objects."""
+LIKELY = 0.5
+"""Minimum probability of a support in a graph [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

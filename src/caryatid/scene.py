@@ -355,7 +355,7 @@ class Scene(Pictured):
         self.surface = self._fused_surface(observation)
         surface, voxels = self._bounds(observation)
         watch.lap("map")
-        observation = self._fitted(observation, shown, voxels, given, named)
+        observation = self._fitted(observation, shown, surface, voxels, given, named)
         if not named:
             observation, new = self._reidentified(observation, new)
         watch.lap("fit")
@@ -472,21 +472,28 @@ class Scene(Pictured):
         return observation.surface, newest
 
     def _fitted(
-        self, observation: Observation, shown: set[int], voxels: VoxelMap, given: bool, named: bool
+        self,
+        observation: Observation,
+        shown: set[int],
+        surface: SupportSurface,
+        voxels: VoxelMap,
+        given: bool,
+        named: bool,
     ) -> Observation:
         """Fit the objects this view changed; split and merge automatic segments as the shapes suggest."""
         if self.config.fusion.method == "sg":
             self._models.fit_newest(set(observation.shown) - {0, SUPPORT_LABEL}, voxels)
             return observation
         self._models.fit_all(shown, voxels)
+        table = observation.beneath(surface, self.config.explanation.spacing)
         if named:
-            self._models.form(shown, voxels)
+            self._models.form(shown, voxels, table)
             return observation
         changed = set() if given else self._models.divide(shown, voxels)
         if changed:
             observation = self._models.nearest(observation, changed)
         given_up = self._models.unite(shown | changed, voxels)
-        self._models.form(shown | changed | set(given_up.values()), voxels)
+        self._models.form(shown | changed | set(given_up.values()), voxels, table)
         return self._renamed(observation, given_up)
 
     def _renamed(self, observation: Observation, given_up: Mapping[int, int]) -> Observation:

@@ -160,8 +160,8 @@ class SegmentationConfig:
     """Minimum number of samples of a segment [points]."""
     min_width: NotNegative = 0.02
     """A segment narrower than this beside a larger one belongs to it [m]; noise rounds creases by as much."""
-    alike: Share = 0.4
-    """Minimum mean affinity of segments to merge [1]: 0 undecided, 1 certain; 0.4 is a probability of 0.7."""
+    alike: Share = 0.3
+    """Affinity above which samples attract each other [1]: 0 undecided, 1 certain; 0.3 is 65 % likely."""
     merge_gap: NotNegative = 0.25
     """Maximum length hidden by a nearer object across which two segments are merged [m]."""
     clearance: NotNegative = 0.008

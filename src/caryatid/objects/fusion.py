@@ -15,7 +15,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, Support, SupportGraph, object_id
+from caryatid.graph import LIKELY, SUPPORT_SURFACE_ID, SceneObject, Support, SupportGraph, object_id
 
 Pair = tuple[str, str]
 Graphs = tuple[SupportGraph, ...]
@@ -115,6 +115,8 @@ def fused_graph(
             if last.probability is not None and newest not in found:
                 # A view that did not find it counts 0.
                 last = replace(last, probability=last.probability * occurrences / len(views))
+            if last.belief < LIKELY:
+                continue
             supports.append(replace(last, certain=certain, occurrences=occurrences, opportunities=len(views)))
     ordered = sorted(objects.values(), key=lambda o: (o.role != "support_surface", o.label))
     rank = {o.id: k for k, o in enumerate(ordered)}

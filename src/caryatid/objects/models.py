@@ -413,14 +413,15 @@ class ObjectModels:
         changed[among] = owners[tree.query(observation.cloud.points_world[among])[1]]
         return observation.with_labels(changed)
 
-    def form(self, labels: set[int], voxels: VoxelMap | None) -> None:
+    def form(self, labels: set[int], voxels: VoxelMap | None, table: Array) -> None:
         """Replace primitives by solids where the points cost less without any primitive.
 
-        A primitive does not explain points of other objects that were seen inside it.
+        A primitive does not explain points of other objects, or of the support surface, inside it.
 
         Args:
             labels: Objects whose points have changed.
             voxels: Space seen free.
+            table: Points (M, 3) [m] of the support surface below the objects.
         """
         noise, config = self._noise(), self._config.explanation
         changed = sorted(labels & self.fits.keys())
@@ -429,7 +430,7 @@ class ObjectModels:
         def formed(number: int) -> SceneObject | None:
             label = changed[number]
             evidence, explanation = self._explained(label, noise, voxels)
-            around = np.concatenate([np.empty((0, 3)), *(seen[k] for k in seen if k != label)])
+            around = np.concatenate([table, *(seen[k] for k in seen if k != label)])
             inside = self.fits[label].shape.signed_distance(around) < -3.0 * noise
             taken = config.outlier * evidence.weight * np.count_nonzero(inside)
             irregular = best_explanation([], evidence, config)

@@ -29,7 +29,9 @@ MULTIPLE = 32
 """The network halves images five times."""
 
 
-def affinities(depth: Image, K: Array, up_camera: Array, offset: float) -> Odds:
+def affinities(
+    depth: Image, rgb: NDArray[np.uint8] | None, K: Array, up_camera: Array, offset: float
+) -> Odds:
     """Log odds that samples lie on the same object, and on any object.
 
     The network is a U-Net of a million weights, trained on simulated tables alone. Affinities at several
@@ -37,6 +39,7 @@ def affinities(depth: Image, K: Array, up_camera: Array, offset: float) -> Odds:
 
     Args:
         depth: (H, W) [m], 0 = no reading.
+        rgb: Colours (H, W, 3), or None.
         K: Pinhole matrix (3, 3) [px].
         up_camera: Unit normal (3,) of the support surface, upwards, in the camera frame.
         offset: Height of the camera over the support surface [m].
@@ -46,17 +49,20 @@ def affinities(depth: Image, K: Array, up_camera: Array, offset: float) -> Odds:
         and whether it is on an object.
     """
     height, width = depth.shape
-    padded = np.pad(depth, ((0, -height % MULTIPLE), (0, -width % MULTIPLE)))
-    logits = _session().run(None, {"features": features(padded, K, up_camera, offset)[None]})[0]
+    border = (0, -height % MULTIPLE), (0, -width % MULTIPLE)
+    padded = np.pad(depth, border)
+    colours = None if rgb is None else np.pad(rgb, (*border, (0, 0)))
+    logits = _session().run(None, {"features": features(padded, colours, K, up_camera, offset)[None]})[0]
     cropped: Image = logits[0, :, :height, :width]
     return cropped
 
 
-def features(depth: Image, K: Array, up_camera: Array, offset: float) -> Image:
-    """What the network sees (8, H, W) of a depth image; arguments as of `affinities`.
+def features(depth: Image, rgb: NDArray[np.uint8] | None, K: Array, up_camera: Array, offset: float) -> Image:
+    """What the network sees (11, H, W) of an image; arguments as of `affinities`.
 
     Validity; height over the surface; height over the mean around it, in 15 and of 3 in 7 pixels, in metres
-    of depth; slopes of 1/z; depth; and the slope of each ray against the surface.
+    of depth; slopes of 1/z; depth; the slope of each ray against the surface; and colours from -1 to 1, all 0
+    without any.
     """
     depth = depth.astype(np.float32)
     valid = (depth > 0.0).astype(np.float32)
@@ -92,7 +98,8 @@ def features(depth: Image, K: Array, up_camera: Array, offset: float) -> Image:
         (depth - 0.8) * valid,
         rising,
     )
-    return np.stack(channels).astype(np.float32)
+    colours = np.zeros((*depth.shape, 3)) if rgb is None else rgb / np.float32(127.5) - np.float32(1.0)
+    return np.concatenate([np.stack(channels), colours.transpose(2, 0, 1)]).astype(np.float32)
 
 
 @cache

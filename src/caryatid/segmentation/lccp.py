@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,12 @@ from caryatid.runtime.parallel import kernel
 from caryatid.sensing.clouds import thin
 
 Index = NDArray[np.intp]
+Borders = tuple[Index, Array, Array]
+"""Pairs (B, 2) of surfels that meet, how much each attracts in all, and the length of their border."""
+CONVEXITY = 10.0
+"""Number of compared pairs of samples that weigh as much as the convexity of one edge [1].
+
+Of 5 to 100 pairs across each edge, most are far from it and say the same."""
 
 
 def grid_edges(
@@ -81,18 +88,33 @@ def _find_pairs(number, points, normals, planes, ways, edge_jump):  # type: igno
 
 
 def convex_parts(
-    points: Array, normals: Array, edges: Index, config: SegmentationConfig, steps: Index | None = None
+    points: Array,
+    normals: Array,
+    edges: Index,
+    config: SegmentationConfig,
+    steps: Index | None = None,
+    borders: Callable[[Index], Borders] | None = None,
 ) -> NDArray[np.int32]:
-    """Cut a sampled surface where it is concave.
+    """Cut a sampled surface where it is concave, and where other evidence says so.
 
     The samples are gathered into surfels that end at creases. Each boundary between two surfels attracts
     where it is flat or convex and repels where it is concave or a step (locally convex connected patches;
     Stein et al., 2014). Surfels are then merged, the most attractive boundary first, each boundary between
-    clusters weighing the mean over its length, so that one bad edge joins nothing.
+    clusters weighing the mean over its length, so that one bad edge joins nothing (average linkage on a
+    signed graph; Bailoni et al., 2022).
 
-    Samples are points (N, 3) [m] with normals (N, 3), edges pairs (E, 2) of neighbours on one surface. Steps
-    are pairs (F, 2) of neighbours in the image, one in front of the other: they repel, because a convex body
-    does not hide itself. Parts (N,) are 1 … n in the order of their first samples, 0 = none.
+    Args:
+        points: Samples (N, 3) [m].
+        normals: Unit normals (N, 3).
+        edges: Pairs (E, 2) of neighbours on one surface.
+        config: Sizes and angles.
+        steps: Pairs (F, 2) of neighbours in the image, one in front of the other: they repel, because a
+            convex body does not hide itself.
+        borders: Further evidence that surfels attract, given the surfel (N,) of each sample, −1 = none; its
+            length counts pairs of samples.
+
+    Returns:
+        Parts (N,): 1 … n in the order of their first samples, 0 = none.
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int32)
@@ -102,12 +124,15 @@ def convex_parts(
     sizes = np.bincount(owner + 1, minlength=len(seeds) + 1)[1:]
     pairs, lengths = _count_borders(owner, edges)
     attraction = _border_attraction(points, normals, owner, sizes, pairs, config)
-    joint, weights, totals = pairs, lengths, attraction * lengths
+    witnesses = [(pairs, attraction * lengths, lengths)]
     if steps is not None:
         # Depth steps along a border repel, each as much as flat surface attracts.
         others, repelling = _count_borders(owner, steps)
-        values = np.concatenate([totals, -repelling]), np.concatenate([lengths, repelling])
-        joint, totals, weights = _summed(np.concatenate([pairs, others]), *values)
+        witnesses.append((others, -repelling, repelling))
+    if borders is not None:
+        joint, totals, weights = borders(owner)
+        witnesses.append((joint, totals / CONVEXITY, weights / CONVEXITY))
+    joint, totals, weights = summed(*map(np.concatenate, zip(*witnesses, strict=True)))
     cluster = _roots(_merge_all(len(seeds), joint.flatten(), totals, weights.copy()))
     apart = distances[distances > 0.0]
     min_width = config.min_width / np.median(apart) if len(apart) else 0.0
@@ -161,10 +186,10 @@ def _count_borders(owner: Index, edges: Index) -> tuple[Any, ...]:
     first, second = owner[edges].T
     across = (first != second) & (first >= 0) & (second >= 0)
     pairs = np.sort(np.stack([first[across], second[across]], axis=-1), axis=1)
-    return _summed(pairs, np.ones(len(pairs)))
+    return summed(pairs, np.ones(len(pairs)))
 
 
-def _summed(pairs: Index, *values: Array) -> tuple[Any, ...]:
+def summed(pairs: Index, *values: Array) -> tuple[Any, ...]:
     """Each pair of P (P, 2) once (B, 2), ascending, and the sums of its values (P,)."""
     factor = int(pairs.max(initial=0)) + 1
     keys, inverse = np.unique(pairs @ np.array([factor, 1]), return_inverse=True)
@@ -265,7 +290,7 @@ def _absorb_slivers(
         if not outer.any():
             break
         both_ways = np.concatenate([joint[outer], joint[outer, ::-1]])
-        joint, border = _summed(both_ways, np.tile(lengths[outer], 2))
+        joint, border = summed(both_ways, np.tile(lengths[outer], 2))
         small, large = joint.T
         # On a grid with diagonals, three edges cross a border for each sample along it.
         narrow = 3.0 * total[small] < min_width * border

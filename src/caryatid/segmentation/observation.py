@@ -14,7 +14,7 @@ from caryatid.geometry.transforms import UP, Array
 from caryatid.runtime.parallel import kernel
 from caryatid.segmentation.segments import segment, segment_cloud
 from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
-from caryatid.sensing.clouds import oriented_points
+from caryatid.sensing.clouds import oriented_points, thin
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
 WHOLE = 0.1
@@ -63,6 +63,13 @@ class Observation:
     def with_labels(self, labels: NDArray[np.int32]) -> Observation:
         """Return the observation with other labels (N,)."""
         return replace(self, cloud=replace(self.cloud, labels=labels))
+
+    def beneath(self, surface: SupportSurface, spacing: float) -> Array:
+        """Places (M, 3) of the surface straight below points of objects, one per square of a spacing [m]."""
+        points = self.cloud.points_world[(self.labels != 0) & (self.labels != SUPPORT_LABEL)]
+        feet = points - surface.height(points)[:, None] * surface.normal_world
+        feet = feet[surface.over(feet, -np.inf, np.inf, 0.0)]
+        return feet[thin(feet, spacing)]
 
     def moved(self, T: Array) -> Observation:
         """Return the observation moved by a rigid transform (4, 4) of the world."""

@@ -18,7 +18,14 @@ from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import kernel, on_threads
 from caryatid.segmentation.affinities import OFFSETS, Odds, affinities
 from caryatid.segmentation.insides import MEETING, merge_insides
-from caryatid.segmentation.lccp import convex_parts, grid_edges, number_by_appearance, wide_parts
+from caryatid.segmentation.lccp import (
+    Borders,
+    convex_parts,
+    grid_edges,
+    number_by_appearance,
+    summed,
+    wide_parts,
+)
 from caryatid.segmentation.samples import Samples, take_samples
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View, depth_behind
@@ -61,17 +68,15 @@ def segment(
     samples = take_samples(view, foreground, surface, config, clouds)
     points, normals = samples.points_camera, samples.normals_camera
     edges, steps = grid_edges(samples.places, points, normals, config.edge_jump)
-    part = convex_parts(points, normals, edges, config, steps)
+    odds = _odds(samples, view, surface) if view.depth.shape[1] >= SMALLEST * config.stride else None
+    borders = None if odds is None else partial(affinity_borders, samples, odds, config.alike)
+    part = convex_parts(points, normals, edges, config, steps, borders)
     wide = wide_parts(samples.image(part))
     # Something beside the surface, at its edge or in the room behind, is not an object on it.
     over = surface.pixels_over(view, 0.0, np.inf, 0.0)[samples.grid][samples.places]
     part = number_by_appearance(_with_share(np.where(wide[part], part, 0), over, 0.5) - 1)
     part, enclosed = merge_insides(samples, part)
-    if view.depth.shape[1] >= SMALLEST * config.stride:
-        T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
-        eye_height = float(surface.height(T[None, :3, 3])[0])
-        odds = affinities(samples.depth, samples.K, surface.normal_world @ T[:3, :3], eye_height)
-        part = merge_alike(samples, part, odds, config.alike)
+    if odds is not None:
         part = number_by_appearance(_with_share(part, odds[-1][samples.places] > 0.0, 0.5) - 1)
     if samples.rgb is not None:
         part = cut_by_colour(samples.image(part), samples.rgb, config.min_size)[samples.places]
@@ -91,6 +96,13 @@ def segment(
         rounds = int(np.sqrt(np.count_nonzero(waiting)))
         _spread_labels(labels[around], np.flatnonzero(waiting), view.depth[around], jump, rounds)
     return labels
+
+
+def _odds(samples: Samples, view: View, surface: SupportSurface) -> Odds:
+    """What the network says of the samples."""
+    T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
+    height = float(surface.height(T[None, :3, 3])[0])
+    return affinities(samples.depth, samples.rgb, samples.K, surface.normal_world @ T[:3, :3], height)
 
 
 def _with_share(part: Labels, own: Mask, least: float) -> Labels:
@@ -218,37 +230,27 @@ def _borders_are_clean(piece_of: NDArray[np.intp], colours: dict[int, Array]) ->
     return True
 
 
-def merge_alike(samples: Samples, part: Labels, odds: Odds, alike: float) -> Labels:
-    """Merge parts (N,) of samples that the network takes for one object.
+def affinity_borders(samples: Samples, odds: Odds, alike: float, owner: NDArray[np.intp]) -> Borders:
+    """How much surfels attract each other by the network's affinities.
 
-    The affinity of two parts is the mean over all pairs of samples, one on each, that the network compares.
-    The two with the highest are merged, and so on while it is at least `alike`.
+    Each pair of samples that the network compares attracts, or repels, by its affinity beyond `alike`. The
+    owners (N,) are the surfels of the samples, −1 = none.
     """
-    image, count = samples.image(part), int(part.max(initial=0)) + 1
+    image = samples.image((owner + 1).astype(np.int32))
     height, width = image.shape
-    total, number = np.zeros((count, count)), np.zeros((count, count))
+    pairs, affinity = [np.empty((0, 2), dtype=np.intp)], [np.empty(0)]
     for (down, right), same in zip(OFFSETS, odds, strict=False):
         if down >= height or abs(right) >= width:
             continue
         here = np.s_[: height - down, max(0, -right) : width - max(0, right)]
         there = np.s_[down:, max(0, right) : width + min(0, right)]
-        a, b = image[here], image[there]
-        across = (a != b) & (a > 0) & (b > 0)
-        pairs = a[across] * count + b[across]
-        affinity = np.tanh(same[here][across] / 2.0)
-        total += np.bincount(pairs, affinity, count**2).reshape(count, count)
-        number += np.bincount(pairs, minlength=count**2).reshape(count, count)
-    total, number, merged = total + total.T, number + number.T, part.copy()
-    while True:
-        mean = np.where(number >= MEETING, total / np.maximum(number, 1.0), -1.0)
-        first, second = divmod(int(mean.argmax()), count)
-        if mean[first, second] < alike:
-            return merged
-        merged[merged == second] = first
-        for table in (total, number):
-            table[first] += table[second]
-            table[:, first] += table[:, second]
-            table[second], table[:, second], table[first, first] = 0.0, 0.0, 0.0
+        across = (image[here] != image[there]) & (image[here] > 0) & (image[there] > 0)
+        both = np.stack([image[here][across], image[there][across]], axis=-1) - 1
+        pairs.append(np.sort(both, axis=1))
+        affinity.append(np.tanh(same[here][across] / 2.0) - alike)
+    joint = np.concatenate(pairs)
+    joint, total, number = summed(joint, np.concatenate(affinity), np.ones(len(joint)))
+    return joint, total, number
 
 
 def merge_occluded(

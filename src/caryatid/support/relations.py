@@ -13,7 +13,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import polygons, transforms
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array, rigid
-from caryatid.graph import Kind, SceneObject, Stability, Support, SupportGraph
+from caryatid.graph import LIKELY, Kind, SceneObject, Stability, Support, SupportGraph
 from caryatid.support.contacts import Contact, find_contacts, find_gap, local_frames
 from caryatid.support.equilibrium import support_shares
 from caryatid.support.stability import (
@@ -25,6 +25,9 @@ from caryatid.support.stability import (
     drop_distance,
     find_tipping,
 )
+
+RULES = 0.4
+"""Weight of the rules against the draws [1]; with it, probabilities in heaps are calibrated."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -88,8 +91,9 @@ def infer(
         rng: Source of the draws for probabilities; None draws the same ones every time.
 
     Returns:
-        The graph. The probability of a support is the mean of two witnesses: the rules, which say 1, and the
-        share of draws in whose equilibrium of forces it holds. With `stability` = `area` there is none.
+        The graph, with the supports that are at least as likely as not. The rules find them; their
+        probabilities are means of the rules' word, weighing `RULES`, and the share of draws in which each
+        holds. With `stability` = `area` there are none, and all that the rules find is in the graph.
 
     Raises:
         InputError: Two objects have the same id.
@@ -98,7 +102,8 @@ def infer(
     if config.stability == "area":
         return graph
     shares, likeness = support_shares(graph, config, rng or np.random.default_rng(0))
-    supports = [replace(s, probability=(1.0 + p) / 2.0) for s, p in zip(graph.supports, shares, strict=True)]
+    likely = [RULES + (1.0 - RULES) * share for share in shares]
+    supports = [replace(s, probability=p) for s, p in zip(graph.supports, likely, strict=True) if p >= LIKELY]
     named = [replace(o, probability=p) for o, p in zip(graph.objects, likeness, strict=True)]
     return replace(graph, objects=tuple(named), supports=tuple(supports))
 
