@@ -52,6 +52,7 @@ from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.robots.recording import RecordingRobot
 from caryatid.sensing.view_sphere import ViewSphere, direction
 from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
+from caryatid.support.relations import Effect
 
 CONFIG = ActiveVisionConfig()
 COUNT = CONFIG.look_directions
@@ -522,8 +523,10 @@ def over_cube(x, y, z):
     ],
 )
 def test_a_goal_is_settled_once_it_is_known_what_moves_and_that_nothing_unseen_rests_on_it(
-    probability, unseen, expected
+    probability, unseen, expected, monkeypatch
 ):
+    moves = {"o1": (Effect("o2", True, "", probability),), "o2": ()}
+    monkeypatch.setattr("caryatid.planning.goals.predict_removal", lambda _, goal, __: moves[goal])
     supports = (replace(ON_TABLE, probability=0.7), Support("o1", "o2", probability=probability))
     graph = SupportGraph((TABLE, CUBE, RIDER), supports)
     voxels = half_known(unseen, TABLE, CUBE, RIDER) if unseen else known(TABLE, CUBE, RIDER)

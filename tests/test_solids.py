@@ -102,7 +102,7 @@ def test_what_stands_in_a_tray_is_supported_by_it_all_over():
 
 def test_what_floats_over_the_floor_of_a_tray_lands_on_it():
     graph = infer(on_a_table(tray(), cube((0.0, 0.0, 0.05))), Config().support)
-    assert "let down 20.0 mm" in graph.support("o1", "o2").why
+    assert "gap 20.0 mm" in graph.support("o1", "o2").why
 
 
 def test_a_solid_is_drawn_without_the_seams_between_its_parts():

@@ -157,14 +157,14 @@ def concepts() -> dict[str, Image.Image]:
         ),
         "contacts": (
             [
-                (planes(last, [s for s in supports if s.certain]), "certain supports: planes and normals"),
-                (planes(last, [s for s in supports if not s.certain]), "uncertain: leaning, held from above"),
+                (planes(last, [s for s in supports if s.kind == "bottom-up"]), "supports from below"),
+                (planes(last, [s for s in supports if s.kind != "bottom-up"]), "leaning, held from above"),
             ], 560, 2,
         ),
         "graph": (
             [
                 (draw_cloud(last.cloud, last.graph, azimuth_of(views[-1])), "the shapes after four views"),
-                (draw_graph(last.graph), "what holds up what: certain, and uncertain (dashed)"),
+                (draw_graph(last.graph), "what holds up what, with probabilities"),
             ], 560, 2,
         ),
         "fusion": ([(draw_graph(steps[k].graph), f"after view {k + 1}") for k in (0, 1, 3)], 420, 3),

@@ -73,7 +73,7 @@ class Support:
         supporter: Id of the object that supports.
         supported: Id of the object that is supported.
         kind: `bottom-up` from below, `lean` from the side, `top-down` by weight from above.
-        certain: False where it was added because an object looked unstable or leans.
+        certain: Whether its probability is at least 0.9; without one, whether it holds from below.
         occurrences: How many times it was extracted and matched: #occ(e) of eq. 2.
         opportunities: How many times both its ends were extracted.
         contact_world: Centre (3,) [m] of the contact patch, or None.

@@ -190,8 +190,7 @@ _DEPARTURES = {
     "with registration": ("registration.enabled=true",),
     "with completion": ("completion.enabled=true",),
     "with plausibility": ("plausibility.rounds=3",),
-    "with balance": ("support.stability=balance", "support.max_drop=0.04"),
-    "with contact margins": ("support.margin_sigma=2.0", "support.reach=0.012", "support.gentle_tilt=25.0"),
+    "with balance": ("support.stability=balance",),
     "matched by points": ("fusion.matching=points",),
     "edges kept by share": ("fusion.keep_share=0.5",),
 }

@@ -297,17 +297,11 @@ class SupportConfig:
     """Support relations, section III-A."""
 
     contact_margin: NotNegative = 0.005
-    """Maximum gap of two shapes in contact, even if both are certain [m]."""
-    margin_sigma: NotNegative = 2.0
-    """Maximum gap in standard deviations, if that is larger [1]; misses one contact in forty."""
-    max_margin: NotNegative = 0.01
-    """Maximum gap of two shapes in contact, however uncertain they are [m]."""
+    """Maximum gap of two shapes in contact if `stability` is `area` [m]; 2.5σ of a fit."""
     reach: NotNegative = 0.012
-    """Maximum gap of a contact assumed where an object would tip without it [m]; 2.5σ of the gap."""
-    gentle_tilt: Angle = 25.0
-    """Steeper planes, where shapes do not overlap, support only objects that would tip otherwise [deg]."""
+    """Maximum gap of two shapes that may touch, or that an object tips across [m]; 2.5σ of the gap."""
     max_tilt: Angle = 75.0
-    """Maximum tilt of a separating plane that bears weight [deg]; steeper normals are almost horizontal."""
+    """Maximum tilt of the separating plane of a support from below [deg]; from there on, objects lean."""
     patch_depth: NotNegative = 0.003
     """Surfaces within this distance of the first contact also touch [m]; noise of one reading at 1.5 m."""
     min_area_ratio: Share = 0.1
@@ -315,8 +309,8 @@ class SupportConfig:
     overhang: NotNegative = 0.003
     """An object tips if its centre of mass is this far outside the support polygon [m]; 1σ of a fit."""
     stability: Literal["area", "balance"] = "balance"
-    """What makes an object unstable: r_s of eq. 1 over its contact points (`area`, the paper's; any object on
-    top may hold it), or also its centre of mass (`balance`; only what counters its tipping holds it)."""
+    """What decides: contact planes and r_s of eq. 1 (`area`, the paper's; all on top of an object with a
+    small support area holds it), or the forces that hold the scene at rest (`balance`)."""
     draws: Count = 12
     """Number of scenes sampled from the fits' uncertainty [1]; a probability near 0.5 is accurate to 0.14."""
     force_share: Share = 0.03
@@ -683,9 +677,7 @@ class Config:
             registration=RegistrationConfig(enabled=False),
             completion=CompletionConfig(enabled=False),
             plausibility=PlausibilityConfig(rounds=0),
-            support=SupportConfig(
-                stability="area", margin_sigma=0.0, reach=0.005, gentle_tilt=75.0, max_drop=0.0
-            ),
+            support=SupportConfig(stability="area"),
             fusion=FusionConfig(matching="shapes", keep_share=0.0),
             active=ActiveVisionConfig(
                 saliency="paper", edge_point="midpoint", path_cost="angle", stop="unchanged"

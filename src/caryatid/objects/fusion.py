@@ -112,9 +112,10 @@ def fused_graph(
         if (mostly and config.method != "pc") or (newest in found and config.method != "sg"):
             last = found[max(found)]
             certain = last.certain if config.method != "sg" else any(s.certain for s in found.values())
-            if last.probability is not None and newest not in found:
+            if last.probability is not None and (newest not in found or config.method == "sg"):
                 # A view that did not find it counts 0.
-                last = replace(last, probability=last.probability * occurrences / len(views))
+                likely = sum(found[v].belief for v in views & found.keys()) / len(views)
+                last = replace(last, probability=likely)
             if last.belief < LIKELY:
                 continue
             supports.append(replace(last, certain=certain, occurrences=occurrences, opportunities=len(views)))

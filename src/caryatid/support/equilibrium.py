@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from caryatid.config import SupportConfig
 from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SceneObject, SupportGraph
+from caryatid.graph import SceneObject
 from caryatid.support.contacts import Contact, find_contacts
 from caryatid.support.plausibility import closing, deviations, effect, gap_rows
 from caryatid.support.stability import contact_area
@@ -30,44 +31,75 @@ _SMOOTH = 1e-4
 """Coefficient of almost no friction [1]; MuJoCo needs some."""
 
 
-def support_shares(
-    graph: SupportGraph, config: SupportConfig, rng: np.random.Generator
-) -> tuple[list[float], list[float]]:
-    """How often each support of a graph is among those that hold the scene, in draws of the unknowns.
+@dataclass(frozen=True, eq=False, slots=True)
+class Holding:
+    """What holds what, over draws of a scene of N objects.
 
-    A supports B in a draw if it carries more than a small share of B's weight; from the side or from above,
-    also if B is at rest with A and moves without it. A draw in which B does not rest, although the real one
-    was seen at rest, counts little for B.
+    Attributes:
+        shares: Share (N, N) of draws in which each object supports each other one [1].
+        forces: Mean force (N, N, 3) of each object on each other one, in weights of the latter, world frame.
+        likeness: Share (N,) of draws in which each object agrees with the estimate by an intersection over
+            union of 0.5 [1].
+        contacts: K contacts of the scene.
+        areas: Corners (M, 3) [m] of each contact's area.
+    """
+
+    shares: Array
+    forces: Array
+    likeness: Array
+    contacts: Sequence[Contact]
+    areas: Sequence[Array]
+
+
+def hold(objects: Sequence[SceneObject], config: SupportConfig, rng: np.random.Generator) -> Holding:
+    """Find out how often objects support each other, in draws of the unknowns.
+
+    A supports B in a draw if it carries more than a small share of B's weight, or if it presses on B, which
+    is at rest with A and moves without it. The latter is asked if B moves faster without A in the estimated
+    scene. A draw in which B does not rest, although the real one was seen at rest, counts little for B.
 
     Args:
-        graph: Objects, and the supports in question.
+        objects: The support surface and the objects.
         config: The unknowns, and when an object is at rest.
         rng: Source of the draws.
-
-    Returns:
-        The share (E,) of draws with each support [1], and the share (N,) of draws in which each object
-        agrees with that of the graph by an intersection over union of 0.5 [1].
     """
-    scene = Equilibrium(graph.objects, config)
-    index = {o.id: k for k, o in enumerate(graph.objects)}
-    pairs = [(index[s.supporter], index[s.supported]) for s in graph.supports]
-    holding, alike, total = np.zeros(len(pairs)), np.zeros(len(index)), np.zeros(len(index))
-    for draw in scene.draws(rng):
+    scene, count = Equilibrium(objects, config), len(objects)
+    held, forces, total = np.zeros((count, count)), np.zeros((count, count, 3)), np.zeros(count)
+    alike, needed = np.zeros(count), np.ones((count, count), dtype=np.bool_)
+    for number, draw in enumerate(scene.draws(rng)):
         balance = scene.solve(draw)
         rests = balance.motion <= config.at_rest
         trust = np.where(rests, 1.0, config.unexplained)
-        without: dict[int, Array] = {}
-        for k, (a, b) in enumerate(pairs):
-            held = balance.pushes[a, b, 2] > config.force_share
-            if not held and rests[b] and graph.supports[k].kind != "bottom-up":
-                if a not in without:
-                    without[a] = scene.solve(draw, without=a).motion
-                held = without[a][b] > balance.motion[b] + config.at_rest
-            holding[k] += held * trust[b]
+        carries = balance.pushes[..., 2] > config.force_share
+        presses = (np.linalg.norm(balance.pushes, axis=-1) > config.force_share) & ~carries & needed
+        fell = np.zeros((count, count), dtype=np.bool_)
+        for k in np.flatnonzero(presses.any(axis=1) & ~scene.fixed):
+            motion = scene.solve(draw, without=int(k)).motion
+            fell[k] = presses[k] & (motion > balance.motion + config.at_rest)
+        if number == 0:
+            needed = fell
+        held += (carries | (fell & rests)) * trust
+        forces += balance.pushes * trust[:, None]
         total += trust
         alike += draw.likeness >= 0.5
-    ends = [b for _, b in pairs]
-    return (holding / total[ends]).clip(0.0, 1.0).tolist(), (alike / config.draws).tolist()
+    shares = (held / total).clip(0.0, 1.0)
+    return Holding(shares, forces / total[:, None], alike / config.draws, scene.contacts, scene.areas)
+
+
+def moved_without(
+    objects: Sequence[SceneObject], index: int, config: SupportConfig, rng: np.random.Generator
+) -> Array:
+    """Probability (N,) that each object moves when one is removed [1]; arguments as of `hold`."""
+    scene, moves = Equilibrium(objects, config), np.zeros(len(objects))
+    total = np.zeros(len(objects))
+    for draw in scene.draws(rng):
+        before, after = scene.solve(draw).motion, scene.solve(draw, without=index).motion
+        trust = np.where(before <= config.at_rest, 1.0, config.unexplained)
+        moves += (after > before + config.at_rest) * trust
+        total += trust
+    moves[index] = 0.0
+    probability: Array = (moves / total).clip(0.0, 1.0)
+    return probability
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -77,7 +109,7 @@ class Draw:
     Attributes:
         shifts: Offset of each centre of mass from its estimate (N, 3) [m], world frame.
         likeness: Intersection over union of each shape with its estimate (N,) [1].
-        gaps: Gap at each contact (K,) [m].
+        gaps: Gap at each contact (K,) [m]; infinite if it cannot press.
         frictions: Coefficient at each contact (K,) [1].
         densities: (N,) [kg/m³].
     """
@@ -107,11 +139,15 @@ class Balance:
 def touching(objects: Sequence[SceneObject], margin: float) -> list[Contact]:
     """Find the contacts of a scene; those with the support surface have its normal.
 
+    Where a third object fills the gap, there is none: the floor of a tray parts its content from the table.
+
     Args:
         objects: The support surface and the objects.
         margin: Largest gap [m].
     """
-    contacts = find_contacts([o.shape for o in objects], margin)
+    shapes = [o.shape for o in objects]
+    low, high = Primitives.of(shapes).bounds()
+    contacts = [c for c in find_contacts(shapes, margin) if not _parted(c, shapes, low, high)]
     for k, contact in enumerate(contacts):
         for index, sign in ((contact.a, 1.0), (contact.b, -1.0)):
             if objects[index].role == "support_surface":
@@ -119,6 +155,19 @@ def touching(objects: Sequence[SceneObject], margin: float) -> list[Contact]:
                 up_world = axes_world[:, np.argmax(np.abs(axes_world[2]))]
                 contacts[k] = replace(contact, normal_world=sign * np.sign(up_world[2]) * up_world)
     return contacts
+
+
+def _parted(contact: Contact, shapes: Sequence[Shape], low: Array, high: Array) -> bool:
+    """Whether a third shape fills the gap.
+
+    Only one whose level box, from corners low to high (N, 3) [m], holds all the contact's points can.
+    """
+    if contact.distance <= 0.0:
+        return False
+    points = contact.points_world
+    around = (low <= points.min(axis=0)) & (points.max(axis=0) <= high)
+    others = set(np.flatnonzero(around.all(axis=1)).tolist()) - {contact.a, contact.b}
+    return any((shapes[k].signed_distance(points) < 0.0).all() for k in others)
 
 
 class Equilibrium:
@@ -137,6 +186,7 @@ class Equilibrium:
     Attributes:
         contacts: K contacts.
         areas: Corners (M, 3) [m] of each contact's area.
+        fixed: Which objects (N,) do not move.
     """
 
     def __init__(self, objects: Sequence[SceneObject], config: SupportConfig) -> None:
@@ -145,10 +195,10 @@ class Equilibrium:
         shapes = [o.shape for o in objects]
         self.contacts = touching(objects, self._fall)
         self._pairs = np.array([(c.a, c.b) for c in self.contacts], dtype=np.intp).reshape(-1, 2)
-        self._fixed = np.array([o.role == "support_surface" for o in objects], dtype=np.bool_)
-        if not self._fixed.any():
+        self.fixed = np.array([o.role == "support_surface" for o in objects], dtype=np.bool_)
+        if not self.fixed.any():
             lifted = [c.b if c.normal_world[2] > 0.0 else c.a for c in self.contacts]
-            self._fixed = ~np.isin(np.arange(len(objects)), lifted)
+            self.fixed = ~np.isin(np.arange(len(objects)), lifted)
         self._volumes = np.array([s.volume for s in shapes])
         self._moments = np.array([s.moments for s in shapes]).reshape(-1, 3)
         self._centres = np.array([s.centre_of_mass for s in shapes]).reshape(-1, 3)
@@ -166,8 +216,8 @@ class Equilibrium:
 
         Shapes move, turn and grow by their fits' uncertainty. Each contact that weight can press shut, its
         normal within the friction cone around the vertical, is closed with the probability that its gap
-        implies; before that, no gap is as likely as any gap up to `max_drop`. Closed gaps correct all
-        shapes, as in `reconcile`. Gaps into which objects fall or tip in the first draw are closed in all.
+        implies; before that, no gap is as likely as any gap up to `reach`. Closed gaps correct all shapes, as
+        in `reconcile`. Gaps into which objects fall or tip in the first draw are closed in all.
 
         Args:
             rng: Source of the draws.
@@ -180,12 +230,12 @@ class Equilibrium:
         found = np.array([c.distance for c in self.contacts])
         rows = gap_rows(self._objects, self.contacts, self._pairs)
         scatter = np.einsum("kpv,kpv->k", rows**2, variance[self._pairs]) + config.touch**2
-        odds = np.exp(-(np.maximum(found, 0.0) ** 2) / (2.0 * scatter)) * self._fall
+        odds = np.exp(-(np.maximum(found, 0.0) ** 2) / (2.0 * scatter)) * config.reach
         shut = odds / (odds + np.sqrt(2.0 * np.pi * scatter))
         steepest = np.cos(np.arctan(np.mean(config.friction)))
         level = np.array([abs(c.normal_world[2]) >= steepest for c in self.contacts], dtype=np.bool_)
         shut *= level
-        fallen = np.zeros(count, dtype=np.bool_)
+        far, fallen = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         for number in range(config.draws):
             first = number == 0
             change = np.clip(rng.standard_normal(sigma.shape), -3.0, 3.0) * sigma * (not first)
@@ -203,16 +253,28 @@ class Equilibrium:
             draw = Draw(
                 np.einsum("nij,nj->ni", self._axes, moved[:, :3]),
                 _likeness(half, moved[:, :3], moved[:, 6:]),
-                np.where(touching | fallen, 0.0, np.maximum(gaps, 0.0)),
+                np.where(far, np.inf, np.where(touching | fallen, 0.0, np.maximum(gaps, 0.0))),
                 np.max(frictions[self._pairs], axis=1, initial=0.0),
                 densities,
             )
             if first:
                 # A wall does not hold an object that falls along it.
                 falling = replace(draw, frictions=np.where(level, draw.frictions, _SMOOTH))
-                fallen = self.solve(falling).pressed & (draw.gaps > config.at_rest * self._fall)
-                draw = replace(draw, gaps=np.where(fallen, 0.0, draw.gaps))
+                far, fallen = self._landings(falling)
+                draw = replace(draw, gaps=np.where(far, np.inf, np.where(fallen, 0.0, draw.gaps)))
             yield draw
+
+    def _landings(self, draw: Draw) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Contacts (K,) that are too far apart to press, and those that objects fall or tip onto.
+
+        Objects tip as far as `reach`; those that nothing carries fall as far as `max_drop`.
+        """
+        far = draw.gaps > self._config.reach
+        upwards = self.solve(replace(draw, gaps=np.where(far, np.inf, draw.gaps))).pushes[..., 2].sum(axis=0)
+        loose = (upwards <= self._config.force_share) & ~self.fixed
+        far &= ~loose[self._pairs].any(axis=1)
+        pressed = self.solve(replace(draw, gaps=np.where(far, np.inf, draw.gaps))).pressed
+        return far, pressed & (draw.gaps > self._config.at_rest * self._fall)
 
     def solve(self, draw: Draw, without: int | None = None) -> Balance:
         """Find the forces that hold a draw, and the objects that still move.
@@ -223,11 +285,12 @@ class Equilibrium:
         """
         model, data, count = self._model, self._data, len(self._objects)
         self._set(draw)
-        gone = (self._pairs[self._contact] == without).any(axis=1)
+        apart = np.isinf(draw.gaps)
+        gone = (apart[:, None] | (self._pairs == without)).any(axis=1)[self._contact]
         data.qacc_warmstart[:] = self._warm
         if len(gone):
             data.contact.exclude[:] = gone
-            data.contact.dist[:] = draw.gaps[self._contact]
+            data.contact.dist[:] = np.where(apart, 1.0, draw.gaps)[self._contact]
             # Open contacts have no friction; otherwise objects sliding along them would push them away.
             rough = np.where(draw.gaps > 0.0, _SMOOTH, draw.frictions)
             data.contact.friction[:, :2] = rough[self._contact, None]
@@ -241,7 +304,7 @@ class Equilibrium:
         acceleration = data.qacc.reshape(-1, 6)[:count]
         turning = np.linalg.norm(acceleration[:, 3:], axis=1) * self._reach
         motion = np.maximum(np.linalg.norm(acceleration[:, :3], axis=1), turning) / _GRAVITY
-        motion[self._fixed] = 0.0
+        motion[self.fixed] = 0.0
         pushes, pressed = np.zeros((count, count, 3)), np.zeros(len(self.contacts), dtype=np.bool_)
         if len(gone):
             active = np.flatnonzero(~gone & (data.contact.efc_address >= 0))
@@ -290,7 +353,7 @@ class Equilibrium:
             across = transforms.perpendicular(normals_world)
             frames = np.concatenate([normals_world, across, np.cross(normals_world, across)], axis=1)
             data.contact.pos[:], data.contact.frame[:] = self._points, frames[self._contact]
-            data.contact.geom[:] = np.where(self._fixed[self._pairs], 0, self._pairs + 1)[self._contact]
+            data.contact.geom[:] = np.where(self.fixed[self._pairs], 0, self._pairs + 1)[self._contact]
         return data
 
 
