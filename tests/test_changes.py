@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from synthetic import box, config_for, edges, look_from, model_of, simulated_scene, simulated_views, vertices
@@ -86,6 +88,12 @@ def test_a_world_that_stays_has_no_history(state):
     scene = Scene()
     for view in views_of(state, np.arange(0.0, 360.0, 60.0), "carmine"):
         scene.update(view)
+    assert scene.changes == ()
+
+
+def test_an_object_without_readings_is_not_gone(scene, state):
+    (view,) = views_of(state, [50.0])
+    scene.update(replace(view, depth=np.where(view.labels == 5, 0.0, view.depth).astype(np.float32)))
     assert scene.changes == ()
 
 

@@ -163,8 +163,8 @@ class Sight:
     def cells(self, points_world: Array, normals_world: Array) -> tuple[int, int]:
         """Number of cells of a surface that the view looks through, and that it confirms.
 
-        A point is looked through if all readings around it lie behind it, and confirmed if its own is at its
-        depth. It does not count if a reading lies in front of it, or if it is turned away.
+        A point is looked through if its reading and all around it lie behind it, and confirmed if its own is
+        at its depth. It does not count without a reading, with one in front of it, or if it is turned away.
 
         Args:
             points_world: (N, 3) [m].
@@ -184,7 +184,7 @@ class Sight:
         beyond = DEPTH_MARGIN * np.maximum(1.0, (z / 1.5) ** 2)
         reading = self._view.depth[v, u]
         confirmed = (reading > 0.0) & (np.abs(reading - z) <= beyond)
-        behind = np.flatnonzero((reading <= 0.0) | (reading > z + beyond))
+        behind = np.flatnonzero(reading > z + beyond)
         around = self._nearest(u[behind], v[behind])
         through = behind[np.isfinite(around) & (around > (z + beyond)[behind])]
         return distinct(points_world[rows[through]]), distinct(points_world[rows[confirmed]])
