@@ -517,7 +517,7 @@ def crop(views: dict[str, Any], rng: Rng) -> tuple[Any, ...] | None:
         depth = np.where(clear & (waves(rng, 8, 40) > rng.uniform(-0.5, 1.5)), 0.0, depth)
         depth = depth.astype(np.float32)
     K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
-    seen = None if rng.random() < 0.2 else photographed(seamed(rgb, labels, rng), rng)
+    seen = None if rng.random() < 0.2 else photographed(rgb, rng)
     return depth, seen, labels, K, up, height * scale + 0.002 * rng.normal()
 
 
@@ -525,17 +525,6 @@ def rows_of(labels: Any, rng: Rng) -> tuple[int, int]:
     """A place of an object, or the middle if there is none."""
     places = np.argwhere(labels > 0)
     return tuple(places[int(rng.integers(len(places)))]) if len(places) else (CROP // 2, CROP // 2)
-
-
-def seamed(rgb: Any, labels: Any, rng: Rng) -> Any:
-    """Colours (H, W, 3) with dark seams between objects, where less light gets, in half of the crops."""
-    if rng.random() < 0.5:
-        return rgb
-    lowest, highest = (
-        f(labels, size=int(rng.integers(2, 4))) for f in (ndimage.minimum_filter, ndimage.maximum_filter)
-    )
-    seam = (lowest != highest) & (labels > 0)
-    return np.where(seam[..., None], rgb * np.float32(rng.uniform(0.3, 1.0)), rgb)
 
 
 def photographed(rgb: Any, rng: Rng) -> Any:
