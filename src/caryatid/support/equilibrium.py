@@ -22,7 +22,7 @@ from caryatid.support.stability import contact_area
 
 _GRAVITY = 9.81
 """[m/s²]."""
-_SOFTNESS = 1e-3
+_SOFTNESS = 5e-3
 """Share of the load by which a contact yields [1]: undetermined forces then spread evenly."""
 _SLIP = 10.0
 """How much more friction yields than pressure [1]: it carries what pressure cannot. Nothing presses
