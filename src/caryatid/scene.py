@@ -413,7 +413,7 @@ class Scene(Pictured):
         if set(observation.shown) <= {0, SUPPORT_LABEL}:
             low, high = self.config.segmentation.clearance, self.config.surface.storey
             over = observation.surface.over(observation.cloud.points_world, low, high, 0.0)
-            if over.sum() >= self.config.segmentation.min_size:
+            if over.sum() * self.config.cloud.voxel**2 >= self.config.segmentation.min_area:
                 remedy = "no mask covers them" if masks else "move closer, or give a larger image or masks"
                 log.warning("%s: no object in %d points above the table; %s", name, over.sum(), remedy)
 

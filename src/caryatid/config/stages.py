@@ -156,8 +156,8 @@ class SegmentationConfig:
     """Angle between normals above which a concave edge separates two surfaces [deg]; LCCP's 10 plus noise."""
     rise: NotNegative = 0.01
     """Two places of a segment are concave if one lies this far above the other's tangent plane [m]."""
-    min_size: Count = 40
-    """Minimum number of samples of a segment [points]."""
+    min_area: NotNegative = 0.0011
+    """Minimum area of a segment [m²]; noise at depth edges and shiny surfaces leaves smaller ones."""
     min_width: NotNegative = 0.02
     """A segment narrower than this beside a larger one belongs to it [m]; noise rounds creases by as much."""
     alike: Share = 0.3

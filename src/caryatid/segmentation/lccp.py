@@ -135,10 +135,13 @@ def convex_parts(
     joint, totals, weights = summed(*map(np.concatenate, zip(*witnesses, strict=True)))
     cluster = _roots(_merge_all(len(seeds), joint.flatten(), totals, weights.copy()))
     apart = distances[distances > 0.0]
-    min_width = config.min_width / np.median(apart) if len(apart) else 0.0
-    cluster = _absorb_slivers(cluster, sizes, pairs, lengths, config.min_size, min_width)
+    if len(apart) == 0:
+        return np.zeros(len(points), dtype=np.int32)
+    spacing = float(np.median(apart))
+    min_size = config.min_area / spacing**2
+    cluster = _absorb_slivers(cluster, sizes, pairs, lengths, min_size, config.min_width / spacing)
     part = np.where(owner >= 0, cluster[owner], -1)
-    large = np.bincount(part + 1) >= config.min_size
+    large = np.bincount(part + 1) >= min_size
     return number_by_appearance(np.where(large[part + 1], part, -1))
 
 
@@ -276,7 +279,7 @@ def _merge_all(count, node, total, length):  # type: ignore[no-untyped-def]
 
 
 def _absorb_slivers(
-    cluster: Index, sizes: Index, pairs: Index, lengths: Array, min_size: int, min_width: float
+    cluster: Index, sizes: Index, pairs: Index, lengths: Array, min_size: float, min_width: float
 ) -> Index:
     """Give clusters too small or too narrow for an object to the neighbour with the longest common border.
 

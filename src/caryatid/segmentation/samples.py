@@ -43,6 +43,11 @@ class Samples:
     rgb: NDArray[np.uint8] | None
     K: Array
 
+    @property
+    def spacing(self) -> float:
+        """Median distance of neighbours on a surface that faces the camera [m]."""
+        return float(np.median(self.points_camera[:, 2])) / float(self.K[0, 0])
+
     def image(self, part: Labels) -> Labels:
         """Put the parts (N,) of the samples on the grid (H, W), 0 elsewhere."""
         image = np.zeros(self.places.shape, dtype=np.int32)

@@ -79,7 +79,8 @@ def segment(
     if odds is not None:
         part = number_by_appearance(_with_share(part, odds[-1][samples.places] > 0.0, 0.5) - 1)
     if samples.rgb is not None:
-        part = cut_by_colour(samples.image(part), samples.rgb, config.min_size)[samples.places]
+        least = config.min_area / samples.spacing**2
+        part = cut_by_colour(samples.image(part), samples.rgb, least)[samples.places]
     part = merge_occluded(samples, part, config, fit_config, rng)
     # Readings of the surface with a common error exceed the clearance, but not by twice as much.
     part = number_by_appearance(_with_share(part, samples.height > 2.0 * config.clearance, 0.05) - 1)
@@ -166,7 +167,7 @@ def _spread_labels(labels, waiting, depth, jump, rounds):  # type: ignore[no-unt
         left = kept
 
 
-def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: int) -> Labels:
+def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: float) -> Labels:
     """Cut parts that consist almost only of pieces of one plain colour each with straight borders.
 
     This separates flush boxes. A printed box has more colours, or borders all over; it stays whole. Parts
