@@ -203,37 +203,38 @@ def _settled(
         The division each start converges to; None if one side is left with too few points.
     """
 
-    def side_explained(sides: list[Mask], rngs: list[np.random.Generator], number: int) -> Explanation:
-        part, rng = evidence.select(sides[number]), rngs[number]
-        return explain(part, config.explanation, config.fit, rng, first_look=first_look)
+    def explained_sides(quick: bool) -> list[tuple[int, tuple[Explanation, Explanation]]]:
+        """Explanations of both sides of each start that has enough points on both."""
+        least = config.split.min_points
+        known = [k for k, second in enumerate(seconds) if min(second.sum(), (~second).sum()) >= least]
+        sides = [side for k in known for side in (~seconds[k], seconds[k])]
+        rngs = rng.spawn(len(sides))
 
-    least = config.split.min_points
+        def side_explained(number: int) -> Explanation:
+            part = evidence.select(sides[number])
+            return explain(part, config.explanation, config.fit, rngs[number], first_look=quick)
+
+        found = on_threads(side_explained, len(sides))
+        return [(k, (found[2 * n], found[2 * n + 1])) for n, k in enumerate(known)]
+
+    seconds = list(starts)
+    for _ in range(rounds):
+        for k, pair in explained_sides(quick=True):
+            # To the shape that explains a point better, together with the points around it.
+            cost = np.stack([point_costs(e.shape, evidence, config.explanation) for e in pair])
+            if k < hinted and evidence.rgb is not None:
+                rgb, second = evidence.rgb, seconds[k]
+                colours = side_colours(rgb, (rgb[~second], rgb[second]), config.explanation)
+                cost = cost * evidence.weight + colours
+            cost = (cost + cost[:, near].mean(axis=2)) / 2.0
+            seconds[k] = _connected(evidence.points, cost[1] < cost[0])
     settled: list[TwoObjects | None] = [None] * len(starts)
-    moving = dict(enumerate(starts))
-    for number in range(rounds + 1):
-        moving = {k: second for k, second in moving.items() if min(second.sum(), (~second).sum()) >= least}
-        sides = [side for second in moving.values() for side in (~second, second)]
-        explained = on_threads(partial(side_explained, sides, rng.spawn(len(sides))), len(sides))
-        for n, k in enumerate(list(moving)):
-            pair, second = (explained[2 * n], explained[2 * n + 1]), moving[k]
-            if number < rounds:
-                # To the shape that explains a point better, together with the points around it.
-                cost = np.stack([point_costs(e.shape, evidence, config.explanation) for e in pair])
-                if k < hinted and evidence.rgb is not None:
-                    rgb = evidence.rgb
-                    colours = side_colours(rgb, (rgb[~second], rgb[second]), config.explanation)
-                    cost = cost * evidence.weight + colours
-                cost = (cost + cost[:, near].mean(axis=2)) / 2.0
-                second = _connected(evidence.points, cost[1] < cost[0])
-            if (second == moving[k]).all():
-                two = _two(evidence, second, pair, near, config)
-                gain = _colours(evidence, second, config.explanation) if k < hinted else 0.0
-                by_colour = gain > price(None, config.explanation)
-                cost_of_parting = unity(evidence, second, config.explanation) - gain
-                settled[k] = replace(two, cost=two.cost + cost_of_parting, by_colour=by_colour)
-                del moving[k]
-            else:
-                moving[k] = second
+    for k, pair in explained_sides(first_look):
+        two = _two(evidence, seconds[k], pair, near, config)
+        gain = _colours(evidence, seconds[k], config.explanation) if k < hinted else 0.0
+        by_colour = gain > price(None, config.explanation)
+        cost_of_parting = unity(evidence, seconds[k], config.explanation) - gain
+        settled[k] = replace(two, cost=two.cost + cost_of_parting, by_colour=by_colour)
     return settled
 
 

@@ -246,10 +246,15 @@ def _merge_all(count, node, total, length):  # type: ignore[no-untyped-def]
         parent[j] = i
         length[e] = 0.0
         degree[i] -= 1
-        side = first[i]
+        side, last = first[i], -1
         while side >= 0:
             if length[side >> 1] > 0.0:
                 shared[node[side ^ 1]] = side >> 1
+                last = side
+            elif last >= 0:  # Borders that are gone leave the list.
+                after[last] = after[side]
+            else:
+                first[i] = after[side]
             side = after[side]
         side = first[j]
         while side >= 0:
