@@ -211,3 +211,12 @@ def test_what_was_said_of_an_object_taken_for_another_counts_for_that():
     fused = fused_graph(tuple(renamed(view, {"o3": "o1"}) for view in views), BOTH)
     assert {o.id: (o.label, o.occurrences) for o in fused.objects[1:]} == {"o1": (1, 2), "o2": (2, 2)}
     assert {s.pair: s.occurrences for s in fused.supports} == {("o1", "o2"): 2, ("o0", "o1"): 1}
+
+
+def test_a_support_that_a_view_lacks_is_not_certain():
+    likely = replace(FULL, supports=tuple(replace(s, probability=1.0) for s in FULL.supports))
+    fused = fused_graph((likely, likely, graph(("o0", "o1"))), replace(SG, keep_share=0.5))
+    assert fused.support("o0", "o1").certain
+    support = fused.support("o1", "o2")
+    assert support.probability == pytest.approx(2.0 / 3.0)
+    assert not support.certain

@@ -15,7 +15,7 @@ from caryatid.config import ActiveVisionConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.points import last_in_voxels, most_central, quantile, select, solve_positive
-from caryatid.geometry.polygons import area, cap, hull, intersection, nearest_on_border
+from caryatid.geometry.polygons import area, cap, hull, intersection, signed_distance
 from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import (
     KINDS,
@@ -268,19 +268,17 @@ def test_the_intersection_is_the_one_of_shapely():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_nearest_point_of_the_border_is_the_one_of_shapely(seed):
+def test_the_distance_to_the_border_is_that_of_shapely(seed):
     rng = np.random.default_rng(seed)
     polygon = random_polygon(rng)
     for corners in (polygon, polygon[:2], polygon[:1]):
         exact = shapely.Polygon(corners) if len(corners) > 2 else shapely.MultiPoint(corners).convex_hull
         border = exact.exterior if len(corners) > 2 else exact
         for x, y in rng.normal(size=(20, 2)):
-            distance, near_x, near_y, inside = nearest_on_border(corners, x, y)
             point = shapely.Point(x, y)
-            assert distance == pytest.approx(border.distance(point))
-            assert np.hypot(near_x - x, near_y - y) == pytest.approx(distance)
-            assert border.distance(shapely.Point(near_x, near_y)) < 1e-12
-            assert inside == (len(corners) > 2 and exact.contains(point))
+            inside = len(corners) > 2 and exact.contains(point)
+            distance = border.distance(point) * (-1.0 if inside else 1.0)
+            assert signed_distance(corners, x, y) == pytest.approx(distance)
 
 
 @pytest.mark.parametrize("seed", range(5))

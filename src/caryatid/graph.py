@@ -20,6 +20,8 @@ ChangeKind = Literal["removed", "moved", "added"]
 """What happens to objects."""
 LIKELY = 0.5
 """Minimum probability of a support in a graph [1]."""
+CERTAIN = 0.9
+"""Minimum probability of a support that is certain [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -73,7 +75,7 @@ class Support:
         supporter: Id of the object that supports.
         supported: Id of the object that is supported.
         kind: `bottom-up` from below, `lean` from the side, `top-down` by weight from above.
-        certain: Whether its probability is at least 0.9; without one, whether it holds from below.
+        certain: Whether its probability is at least `CERTAIN`; without one, whether it holds from below.
         occurrences: How many times it was extracted and matched: #occ(e) of eq. 2.
         opportunities: How many times both its ends were extracted.
         contact_world: Centre (3,) [m] of the contact patch, or None.

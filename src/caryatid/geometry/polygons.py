@@ -83,13 +83,12 @@ def area(polygon: NDArray[np.float64]) -> float:
 
 
 @kernel
-def nearest_on_border(polygon: NDArray[np.float64], x: float, y: float) -> tuple[float, float, float, bool]:
-    """Distance [m] of a point to a polygon's (N, 2) border, the nearest point there, and if it is inside.
+def signed_distance(polygon: NDArray[np.float64], x: float, y: float) -> float:
+    """Distance [m] of a point to a polygon's (N, 2) border, negative inside.
 
-    Nothing is inside a line or a point; a point on the border of an area is inside.
+    Nothing is inside a line or a point.
     """
-    least, near_x, near_y = np.inf, x, y
-    inside = len(polygon) > 2
+    least, inside = np.inf, len(polygon) > 2
     for i in range(len(polygon)):
         from_x, from_y = polygon[i - 1, 0], polygon[i - 1, 1]
         along_x, along_y = polygon[i, 0] - from_x, polygon[i, 1] - from_y
@@ -98,12 +97,9 @@ def nearest_on_border(polygon: NDArray[np.float64], x: float, y: float) -> tuple
         if squared > 0.0:
             share = ((x - from_x) * along_x + (y - from_y) * along_y) / squared
             share = min(max(share, 0.0), 1.0)
-        at_x, at_y = from_x + share * along_x, from_y + share * along_y
-        distance = np.hypot(x - at_x, y - at_y)
-        if distance < least:
-            least, near_x, near_y = distance, at_x, at_y
+        least = min(least, np.hypot(x - from_x - share * along_x, y - from_y - share * along_y))
         inside = inside and _turn(polygon, i - 1, i, x, y) >= 0.0
-    return least, near_x, near_y, inside
+    return -least if inside else least
 
 
 @kernel

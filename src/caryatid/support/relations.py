@@ -12,13 +12,10 @@ from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.geometry import polygons
 from caryatid.geometry.transforms import Array
-from caryatid.graph import LIKELY, Kind, SceneObject, Stability, Support, SupportGraph
+from caryatid.graph import CERTAIN, LIKELY, Kind, SceneObject, Stability, Support, SupportGraph
 from caryatid.support.contacts import Contact, find_gap
 from caryatid.support.equilibrium import hold, moved_without, touching
 from caryatid.support.stability import assess
-
-CERTAIN = 0.9
-"""Minimum probability of a support that is called certain [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -85,11 +85,7 @@ def assess(shape: Shape, patches: Sequence[Array], config: SupportConfig) -> Sta
         config: Limits of both tests.
     """
     polygon = polygons.hull(np.concatenate([np.empty((0, 2)), *patches]))
-    overhang = np.inf
-    if len(polygon):
-        x, y = shape.centre_of_mass[:2]
-        distance, _, _, inside = polygons.nearest_on_border(polygon, x, y)
-        overhang = -distance if inside else distance
+    overhang = float(polygons.signed_distance(polygon, *shape.centre_of_mass[:2]))
     ratio = min(1.0, polygons.area(polygon) / polygons.area(ground_outline(shape)))
     tips = config.stability == "balance" and overhang > config.overhang
     return Stability(ratio, overhang, ratio < config.min_area_ratio, tips)
