@@ -159,7 +159,7 @@ class SegmentationConfig:
     min_area: NotNegative = 0.0011
     """Minimum area of a segment [m²]; noise at depth edges and shiny surfaces leaves smaller ones."""
     min_width: NotNegative = 0.02
-    """A segment narrower than this beside a larger one belongs to it [m]; noise rounds creases by as much."""
+    """A segment narrower than this beside larger ones belongs to one [m]; noise rounds creases by as much."""
     alike: Share = 0.3
     """Affinity above which samples attract each other [1]: 0 undecided, 1 certain; 0.3 is 65 % likely."""
     merge_gap: NotNegative = 0.25

@@ -288,7 +288,7 @@ def _absorb_slivers(
 ) -> Index:
     """Give clusters too small or too narrow for an object to the neighbour with the longest common border.
 
-    A sliver lies along a larger neighbour: its width [samples] is its size over the length of their border.
+    A sliver lies along larger neighbours: its width [samples] is its size over the length of their borders.
     """
     cluster = cluster.copy()
     for _ in range(3):
@@ -301,7 +301,8 @@ def _absorb_slivers(
         joint, border = summed(both_ways, np.tile(lengths[outer], 2))
         small, large = joint.T
         # On a grid with diagonals, three edges cross a border for each sample along it.
-        narrow = 3.0 * total[small] < min_width * border
+        around = np.bincount(small, border * (total[small] < total[large]), minlength=len(cluster))
+        narrow = 3.0 * total[small] < min_width * around[small]
         absorbed = (total[small] < total[large]) & (narrow | (total[small] < min_size))
         small, large, border = small[absorbed], large[absorbed], border[absorbed]
         order = np.lexsort((large, border, small))
