@@ -14,11 +14,11 @@ from caryatid.sensing.views import View
 BASELINE = 0.1
 """Maximum distance of a depth camera's two eyes, or of eye and projector [m]; a Kinect's is 0.075."""
 COARSER = 2
-"""How much coarser holes are sampled than segments [1]; they are as large as an object."""
+"""How much coarser holes are sampled than segments [1]; they are as wide as an object."""
 
 
 def count_holes(view: View, surface: SupportSurface, config: SegmentationConfig) -> int:
-    """Count the regions over the support surface that have no depth and are as large as an object.
+    """Count the regions over the support surface that have no depth and are as wide as an object.
 
     Places that only one of the sensor's eyes sees have no depth either. Such a shadow lies beside the object
     that casts it, in the same row, and is no wider than the sensor's baseline makes it on the surface.
@@ -26,7 +26,7 @@ def count_holes(view: View, surface: SupportSurface, config: SegmentationConfig)
     Args:
         view: A view with a pose.
         surface: The support surface.
-        config: Sampling, and size of the smallest segment.
+        config: Sampling, and width of the narrowest segment.
     """
     step = COARSER * config.stride
     every = np.s_[::step, ::step]
