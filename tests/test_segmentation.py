@@ -134,6 +134,21 @@ def test_a_cloud_of_almost_nothing_has_no_parts(count):
     assert segment_cloud(cloud, surface, SegmentationConfig()).tolist() == [0] * count
 
 
+@pytest.mark.parametrize("spacing", [0.002, 0.005])
+def test_the_area_of_a_segment_does_not_depend_on_the_spacing_of_points(spacing):
+    surface = surface_of(table_scene(from_the_side()))
+    points, normals = [], []
+    for x, side in ((-0.2, 0.06), (0.2, 0.02)):
+        steps = np.arange(0.0, side, spacing)
+        u, v = (g.ravel() for g in np.meshgrid(steps, steps))
+        points.append(np.column_stack([x + u, v, np.full(len(u), 0.8)]))
+        normals.append(np.tile(UP, (len(u), 1)))
+    cloud = Cloud(np.concatenate(points), np.concatenate(normals))
+    labels = segment_cloud(cloud, surface, SegmentationConfig())
+    assert set(labels[: len(points[0])]) == {1}
+    assert set(labels[len(points[0]) :]) == {0}
+
+
 def bent_sheet(angle: float):
     """Two square sheets that meet along x = 0 under an angle [deg]; positive = a valley seen from above."""
     side = np.arange(0.0, 0.1, 0.005)

@@ -51,6 +51,6 @@ def count_holes(view: View, surface: SupportSurface, config: SegmentationConfig)
     # A gap at the side of the image may be the shadow of something outside.
     hole = over & ~known & (np.minimum(*ends) > 0.0) & (right - left - 1 > shadow)
     parts, count = ndimage.label(hole)
-    # A region is at least as wide as the circle between the readings around it [m].
+    # Width of the largest circle that certainly fits between the readings around a region [m].
     width = 2.0 * (ndimage.distance_transform_edt(hole) - 1.0) / (K[0, 0] * np.where(hole, level, 1.0))
     return int(np.count_nonzero(ndimage.maximum(width, parts, np.arange(1, count + 1)) >= config.min_width))
