@@ -7,6 +7,12 @@ Each scene is cleared in physics: the true objects are lifted, and what is distu
 unharmed where no lift moved another object by more than 2 cm or 15°, and cleared where nothing is left. With
 goals, objects drawn at random are to be reached instead; the fewest lifts are those of a search on the true
 scene, breadth first, among the objects that stand in one another's way.
+
+    python benchmarks/clear.py --set gripper.kind=parallel
+
+With a gripper, each lift is first carried out by a simulated one: a free-flying hand moves along the approach
+among the true objects, closes its fingers with 30 N, and lifts the object by friction. A grasp is clear if it
+touches nothing but its object; it holds if the object rises with it.
 """
 
 from __future__ import annotations
@@ -16,6 +22,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
+import mujoco
 import numpy as np
 import pandas as pd
 import tyro
@@ -24,16 +31,17 @@ from rich.console import Console
 
 from caryatid.benchmark.episodes import open_scene
 from caryatid.benchmark.suites import DENSE, HEAPED
-from caryatid.config import Config, SegmentationMethod
+from caryatid.config import Config, GripperConfig, SegmentationMethod
 from caryatid.config.settings import read_settings
 from caryatid.exploration import Explorer
 from caryatid.geometry.transforms import Array
-from caryatid.graph import TakeStep
+from caryatid.graph import Grasp, TakeStep
 from caryatid.manipulation.clearing import clear
 from caryatid.manipulation.dismantling import SimulatedHands, Taken
+from caryatid.manipulation.grasps import gripper_boxes
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.setup import make_simulation
-from caryatid.simulation.world import SimulatedScene, poses_of, strayed
+from caryatid.simulation.world import SimulatedScene, poses_of, quaternion, strayed
 
 
 @dataclass(frozen=True)
@@ -71,9 +79,12 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
     known: dict[str, Any] = {"segmentation": args.segmentation, "seed": args.seed, "config": config}
     explorer = Explorer(simulation.camera, simulation.robot, **known)
     hands, done, alone = SimulatedHands(scene, config), list[Taken](), list[bool]()
+    grasps = list[tuple[list[str], bool]]()
 
     def take(step: TakeStep) -> bool:
-        before = hands.state
+        before, body = hands.state, hands.bodies(explorer.scene.graph).get(step.object_id)
+        if step.grasp is not None and body in hands.left:
+            grasps.append(grasped(scene, before, step.grasp, body, config.gripper))
         done.append(hands.take(step, hands.bodies(explorer.scene.graph)))
         if not done[-1].ok:
             alone.append(moves_alone(scene, before, done[-1], config))
@@ -86,7 +97,8 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
     harm = [f"{t.step.object_id}: {', '.join(t.disturbed)}" for t in lifted if not t.ok]
     row = {"scene": name, "objects": len(scene.object_bodies), "lifts": len(lifted), "views": len(steps)}
     row |= {"missed": len(done) - len(lifted), "harmed": len(harm), "alone": sum(alone), "harm": harm}
-    row |= {"stop": steps[-1].stop}
+    row |= {"stop": steps[-1].stop, "grasps": len(grasps), "clear": sum(not t for t, _ in grasps)}
+    row |= {"held": sum(held for _, held in grasps), "touched": [t for t, _ in grasps if t]}
     if goal is None:
         return row | {"cleared": float(not hands.left)}
     body = scene.object_bodies[goal]
@@ -100,6 +112,75 @@ def moves_alone(scene: SimulatedScene, before: Array, taken: Taken, config: Conf
     after = Lifting(scene.spec, names).rest(before, (), 0.25 * len(taken.film))
     moved = strayed(before, after, config.lift.moved, config.lift.turned)
     return {n for n, m in zip(names, moved, strict=True) if m} >= set(taken.disturbed)
+
+
+def grasped(
+    scene: SimulatedScene, state: Array, grasp: Grasp, body: str, gripper: GripperConfig
+) -> tuple[list[str], bool]:
+    """The bodies other than its own that a simulated gripper touches, and whether it lifts its own."""
+    spec, T = scene.spec.copy(), grasp.T_world_gripper
+    # Elliptic cones with stiff friction, as MuJoCo's documentation advises for grasps.
+    spec.option.timestep, spec.option.cone, spec.option.impratio = 0.002, mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
+    start, R = T[:3, 3] - grasp.travel * T[:3, 2], T[:3, :3]
+    spec.worldbody.add_body(name="goal", mocap=True, pos=start, quat=quaternion(R))
+    hand = spec.worldbody.add_body(name="gripper", pos=start, quat=quaternion(R), gravcomp=1.0)
+    hand.add_freejoint()
+    # A body that only follows a mocap body, and is none, has a velocity, so that friction can drag things.
+    weld = spec.add_equality(name1="goal", name2="gripper", type=mujoco.mjtEq.mjEQ_WELD, solref=[0.005, 1.0])
+    weld.objtype, weld.data = mujoco.mjtObj.mjOBJ_BODY, [*[0.0] * 6, 1.0, *[0.0] * 3, 1.0, 0.0]
+    parts = gripper_boxes(gripper, grasp.width)
+    for number, (low, high) in enumerate(parts):
+        part = hand
+        if number < len(parts) - 1 and gripper.kind == "parallel":
+            part = hand.add_body(name=f"finger{number}", gravcomp=1.0)
+            inwards = [-1.0, 0.0, 0.0] if number == 0 else [1.0, 0.0, 0.0]
+            slide = {"type": mujoco.mjtJoint.mjJNT_SLIDE, "axis": inwards, "range": [0.0, gripper.opening]}
+            part.add_joint(name=f"finger{number}", limited=True, damping=50.0, **slide)
+            motor = spec.add_actuator(name=f"finger{number}", target=f"finger{number}")
+            motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        shape = {"type": mujoco.mjtGeom.mjGEOM_BOX, "pos": (low + high) / 2.0, "size": (high - low) / 2.0}
+        part.add_geom(
+            name=f"gripper{number}",
+            density=5000.0,
+            solref=[0.005, 1.0],
+            friction=[1.0, 0.005, 0.0001],
+            condim=4,
+            **shape,
+        )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    names = list(scene.object_bodies.values())
+    for name, pose in zip(names, state, strict=True):
+        data.qpos[model.jnt_qposadr[model.body(name).jntadr[0]] + np.arange(7)] = pose
+    own, root = model.body("gripper").id, model.body_rootid[model.geom_bodyid]
+    target, touched = model.body(body).id, set[str]()
+    closing = gripper.kind == "parallel"
+    height = data.qpos[model.jnt_qposadr[model.body(body).jntadr[0]] + 2]
+    reach = np.inf
+    for phase, seconds in (("approach", 1.0), ("close", 0.5), ("lift", 1.0)):
+        for step in range(round(seconds / 0.002)):
+            share = (step + 1) * 0.002 / seconds
+            if phase == "approach":
+                data.mocap_pos[0] = start + share * grasp.travel * T[:3, 2]
+                if closing:
+                    data.ctrl[:] = -2.0
+            elif phase == "close":
+                data.ctrl[:] = -2.0 + 32.0 * share if closing else 0.0
+            else:
+                data.mocap_pos[0] = T[:3, 3] + [0.0, 0.0, share * grasp.travel]
+            if phase == "lift" and not closing:
+                break
+            mujoco.mj_step(model, data)
+            for a, b in data.contact.geom[: data.ncon]:
+                pair = {root[a], root[b]}
+                if own in pair and len(pair) == 2 and not (pair & {target}):
+                    touched.add(model.body((pair - {own}).pop()).name)
+        if phase == "approach" and not closing:
+            disc = model.geom("gripper0").id
+            solid = np.flatnonzero((root == target) & (model.geom_contype != 0))
+            reach = min(mujoco.mj_geomDistance(model, data, disc, int(g), 0.1, None) for g in solid)
+    rise = data.qpos[model.jnt_qposadr[model.body(body).jntadr[0]] + 2] - height
+    return sorted(touched), bool(rise > grasp.travel / 2.0 if closing else reach < 0.005)
 
 
 def fewest(scene: SimulatedScene, goal: str, config: Config) -> int:
@@ -133,6 +214,8 @@ def summary(rows: pd.DataFrame) -> dict[str, float]:
     found |= {"lifts unharmed": 1.0 - rows["harmed"].sum() / rows["lifts"].sum()}
     found |= {"harmful lifts": rows["harmed"].sum(), "of these, harm without a lift": rows["alone"].sum()}
     found |= {"views per lift": rows["views"].sum() / rows["lifts"].sum(), "missed": rows["missed"].sum()}
+    if rows["grasps"].sum():
+        found |= {f"grasps {name}": rows[name].sum() / rows["grasps"].sum() for name in ("clear", "held")}
     if "fewest" in rows:
         known = rows[(rows["cleared"] == 1.0) & (rows["fewest"] > 0)]
         found |= {"lifts": known["lifts"].sum(), "fewest": known["fewest"].sum()}

@@ -6,21 +6,32 @@ import json
 import re
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 from conftest import SMALL, run_command
 from synthetic import box, sphere, table_object, thing
 
-from caryatid.config import Config, LiftConfig, RehearsalConfig, SupportConfig
+from caryatid.config import Config, GripperConfig, LiftConfig, RehearsalConfig, SupportConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry.shapes import Uncertainty
-from caryatid.graph import Support, SupportGraph, TakeStep
+from caryatid.graph import Grasp, Support, SupportGraph, TakeStep
 from caryatid.manipulation.dismantling import SimulatedHands, bodies_of
+from caryatid.manipulation.grasps import Blocked, find_grasp, gripper_boxes
 from caryatid.manipulation.order import plan_order
+from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.truth import ground_truth
-from caryatid.simulation.world import TABLE_HEIGHT, Body, build_spec, posed, poses_of, scene_from_spec
+from caryatid.simulation.world import (
+    TABLE_HEIGHT,
+    Body,
+    build_spec,
+    posed,
+    poses_of,
+    quaternion,
+    scene_from_spec,
+)
 from caryatid.steps import read_run, read_steps
 from caryatid.support.relations import infer
 
@@ -124,6 +135,104 @@ class TestOrder:
             plan_order(SupportGraph((table_object(TOP), *crowd)), CONFIG)
 
 
+JAW = GripperConfig(kind="parallel", opening=0.08)
+DISC = GripperConfig(kind="suction")
+
+
+def with_gripper(gripper):
+    return replace(CONFIG, gripper=gripper)
+
+
+def touched(grasp, gripper, shapes):
+    """Indices of the shapes that MuJoCo finds in contact with a gripper on its way to a grasp, and up."""
+    spec = build_spec([Body(shape) for shape in shapes], "grasps")
+    hand = spec.worldbody.add_body(name="hand", mocap=True)
+    for low, high in gripper_boxes(gripper, grasp.width):
+        hand.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=(low + high) / 2, size=(high - low) / 2)
+    model = spec.compile()
+    data, found = mujoco.MjData(model), set()
+    R, at = grasp.T_world_gripper[:3, :3], grasp.T_world_gripper[:3, 3]
+    ways = [at - s * grasp.travel * R[:, 2] for s in np.linspace(0, 1, 21)]
+    ways += [at + [0.0, 0.0, s * grasp.travel] for s in np.linspace(0, 1, 21)]
+    for place in ways:
+        data.mocap_pos[0], data.mocap_quat[0] = place, quaternion(R)
+        mujoco.mj_forward(model, data)
+        for pair in data.contact.geom[: data.ncon]:
+            names = {model.body(model.geom_bodyid[g]).name for g in pair}
+            found |= names - {"hand"} if "hand" in names else set()
+    return found
+
+
+class TestGrasps:
+    @pytest.mark.parametrize("gripper", [JAW, DISC])
+    def test_nothing_touches_a_gripper_on_its_way(self, gripper):
+        """On random tables, as MuJoCo sees it; many objects can be grasped, and some cannot."""
+        rng, offered, asked = np.random.default_rng(5), 0, 0
+        for _ in range(6):
+            shapes = [
+                box((*rng.uniform(-0.1, 0.1, 2), TOP + size[2] / 2), size, rng.uniform(0, 180))
+                for size in rng.uniform((0.02, 0.03, 0.03), (0.07, 0.12, 0.12), (5, 3))
+            ]
+            others = {str(k): shape for k, shape in enumerate(shapes)} | {"t": table_object(TOP).shape}
+            for k, shape in enumerate(shapes):
+                around = {i: other for i, other in others.items() if i != str(k)}
+                grasp = find_grasp(shape, around, gripper, 0.3)
+                asked += 1
+                if isinstance(grasp, Grasp):
+                    offered += 1
+                    assert touched(grasp, gripper, shapes) <= ({f"object{k}"} if gripper is DISC else set())
+        assert 0.4 * asked < offered < asked
+
+    def test_a_jaw_closes_on_two_opposite_sides(self):
+        size = np.array([0.05, 0.12, 0.06])
+        grasp = find_grasp(box((0.0, 0.0, TOP + 0.03), size, 23.0), {}, JAW, 0.3)
+        assert grasp.width == pytest.approx(0.05, abs=1e-6)
+        assert abs(
+            grasp.T_world_gripper[:3, 0] @ [np.cos(np.radians(23.0)), np.sin(np.radians(23.0)), 0.0]
+        ) == pytest.approx(1.0)
+        np.testing.assert_allclose(grasp.T_world_gripper[:3, 2], [0.0, 0.0, -1.0], atol=1e-9)
+        assert grasp.seen_free is None
+        assert json.loads(json.dumps(grasp.to_json()))["width"] == grasp.width
+
+    def test_it_says_what_is_in_the_way(self):
+        block = box((0.0, 0.0, TOP + 0.04), (0.06, 0.06, 0.08))
+        walls = {
+            f"o{k}": box((*at, TOP + 0.06), size)
+            for k, (at, size) in enumerate(
+                [((0.042, 0.0), (0.02, 0.2, 0.12)), ((0.0, 0.042), (0.06, 0.02, 0.12))], start=2
+            )
+        }
+        assert find_grasp(block, walls, JAW, 0.3).by in (("o2",), ("o3",))
+        assert isinstance(find_grasp(block, {"o2": walls["o2"]}, JAW, 0.3), Grasp)
+        assert isinstance(find_grasp(block, walls, DISC, 0.3), Grasp)  # its tube is narrow
+        wide = box((0.0, 0.0, TOP + 0.04), (0.1, 0.1, 0.08))
+        assert find_grasp(wide, {}, JAW, 0.3) == Blocked((), "no side fits between the fingers")
+        assert find_grasp(sphere((0.0, 0.0, TOP + 0.03), 0.03), {}, DISC, 0.3).why == "no side is flat enough"
+
+    def test_unseen_space_and_the_arm_forbid_grasps(self):
+        block = box((0.0, 0.0, TOP + 0.03), (0.06, 0.06, 0.06))
+        unseen = VoxelMap.around((0.0, 0.0, TOP), CONFIG.voxels)
+        assert find_grasp(block, {}, JAW, 0.3, voxels=unseen).why == "the space around it was not seen empty"
+        seen = replace(unseen, passes=np.ones_like(unseen.passes))
+        assert find_grasp(block, {}, JAW, 0.3, voxels=seen).seen_free == 1.0
+        tilted = find_grasp(block, {}, JAW, 0.3, reachable=lambda T: T[:, 2, 2] > -0.9)
+        assert tilted.T_world_gripper[2, 2] > -0.9
+        nowhere = find_grasp(block, {}, JAW, 0.3, reachable=lambda T: np.zeros(len(T), dtype=bool))
+        assert nowhere == Blocked((), "every grasp is out of reach")
+
+    def test_an_order_offers_only_lifts_that_a_gripper_can_do(self):
+        assert [s.grasp for s in plan_order(tower(), CONFIG).steps] == [None] * 4
+        order = plan_order(tower(), with_gripper(DISC), goal="o1", hands=1)
+        assert [s.object_id for s in order.steps] == ["o3", "o2", "o1"]
+        tops = [s.grasp.T_world_gripper[2, 3] for s in order.steps]
+        assert tops == pytest.approx([TOP + 0.18, TOP + 0.12, TOP + 0.06])
+        assert order.steps[0].why.endswith("; the gripper grasps it, 0° from straight down")
+        narrow = plan_order(tower(), with_gripper(JAW), hands=1)
+        assert [s.object_id for s in narrow.steps] == ["o4"]
+        assert not narrow.safe
+        assert "no object can be grasped: o3: no side fits between the fingers" in narrow.refusal
+
+
 def in_physics(*shapes):
     return scene_from_spec(build_spec([Body(shape) for shape in shapes], "test"), "test", "test")
 
@@ -199,6 +308,11 @@ class TestCommands:
             assert step.keys() == {"object", "hold", "safe", "risk", "probability", "why"}
             assert (step["safe"], step["hold"]) == (True, [])
             assert step["probability"] == 1.0 - step["risk"]
+        assert run_command("order", kept_run, "--json", "--gripper", "parallel", *QUICK) == 0
+        grasps = [step["grasp"] for step in json.loads(capsys.readouterr().out)["steps"]]
+        assert [np.shape(grasp["T_world_gripper"]) for grasp in grasps] == [(4, 4)]  # o1 is too wide
+        assert run_command("order", kept_run, "--gripper", "claw", *QUICK) == 2
+        assert "parallel" in capsys.readouterr().err
         assert run_command("order", kept_run, "--goal", "o2", *QUICK) == 0
         table = capsys.readouterr().out
         assert "a safe order" in table

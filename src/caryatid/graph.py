@@ -212,6 +212,29 @@ class Change:
     why: str
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Grasp:
+    """How a gripper takes hold of an object.
+
+    Attributes:
+        T_world_gripper: Pose (4, 4) at the grasp: z along the approach, x along the closing direction, origin
+            between the fingertips or at the middle of the disc.
+        width: Width of the object between the fingers [m]; 0 for suction.
+        travel: Length of the straight path to it along z [m], with nothing in the way.
+        seen_free: Share of the space around that path which was seen empty [1]; None if unknown.
+    """
+
+    T_world_gripper: Array
+    width: float
+    travel: float
+    seen_free: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Entry `grasp` of a step in the output of `--json`."""
+        known = {"T_world_gripper": self.T_world_gripper.tolist(), "width": self.width}
+        return known | {"travel": self.travel, "seen_free": self.seen_free}
+
+
 @dataclass(frozen=True, slots=True)
 class TakeStep:
     """One object to remove.
@@ -222,6 +245,7 @@ class TakeStep:
         safe: The risk is no higher than `rehearsal.risk`.
         risk: Probability that another object moves, from the share of the rehearsals in which one did [1].
         why: The reason for the step, for a person to read.
+        grasp: How the gripper takes hold of it; None without a gripper.
     """
 
     object_id: str
@@ -229,11 +253,13 @@ class TakeStep:
     safe: bool
     risk: float
     why: str
+    grasp: Grasp | None = None
 
     def to_json(self) -> dict[str, Any]:
         """One entry of `steps` in the output of `--json`."""
         known = {"object": self.object_id, "hold": list(self.hold), "safe": self.safe, "risk": self.risk}
-        return known | {"probability": 1.0 - self.risk, "why": self.why}
+        grasp = {} if self.grasp is None else {"grasp": self.grasp.to_json()}
+        return known | {"probability": 1.0 - self.risk, "why": self.why} | grasp
 
 
 def object_id(label: int) -> str:

@@ -21,7 +21,7 @@ from caryatid.config import Config
 from caryatid.config.settings import changed_settings
 from caryatid.errors import InputError
 from caryatid.exploration import RobotPose, Step
-from caryatid.graph import Change, SupportGraph, TakeStep
+from caryatid.graph import Change, Grasp, SupportGraph, TakeStep
 from caryatid.io import images
 from caryatid.io.graph_json import graph_text, read_graph
 from caryatid.io.json_files import json_text, parse_json, read_json
@@ -38,7 +38,10 @@ AGAIN: Final = "run caryatid again"
 """Remedy for a broken file of a run."""
 PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
 """Packages whose versions run.json records."""
-PARTS = (View, Cloud, ViewSphere, Candidates, Decision, PointOfInterest, Posture, RobotPose, Change, TakeStep)
+PARTS = (
+    View, Cloud, ViewSphere, Candidates, Decision, PointOfInterest, Posture, RobotPose, Change, TakeStep,
+    Grasp,
+)  # fmt: skip
 """Classes that a step is made of."""
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from caryatid.cli import options
-from caryatid.config.choices import ExportFormat
+from caryatid.config.choices import ExportFormat, GripperKind
 from caryatid.errors import InputError
 
 OBJECT = 20_000
@@ -127,6 +127,10 @@ class OrderCommand(options.ComputingCommand):
     """Object to reach; remove no more than necessary."""
     hands: Literal[1, 2] = 2
     """Number of hands; with 2, one may hold an object while the other lifts one."""
+    gripper: Annotated[
+        GripperKind | None, options.one_of(GripperKind), options.default_of("gripper.kind")
+    ] = None
+    """Offer only lifts with a grasp on a free path; dimensions are the settings `gripper.*`."""
     risk: Annotated[float | None, options.default_of("rehearsal.risk", "P")] = None
     """Maximum probability that a lift moves another object."""
 
@@ -137,7 +141,7 @@ class OrderCommand(options.ComputingCommand):
         from caryatid.steps import read_run
         from caryatid.viz.tables import order_table
 
-        config = self.settings.read({"rehearsal.risk": self.risk})
+        config = self.settings.read({"rehearsal.risk": self.risk, "gripper.kind": self.gripper})
         seed, graph = self.settings.seed, read_run(self.run).graph
         with self.output.working("rehearsing"):
             order = plan_order(graph, config, goal=self.goal, hands=self.hands, seed=seed, threads=cores())

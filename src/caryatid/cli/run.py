@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from caryatid.cli import options
+from caryatid.config.choices import GripperKind
 from caryatid.errors import InputError
 
 if TYPE_CHECKING:
@@ -267,6 +268,10 @@ class Clear(options.ExploringCommand):
     """Object to reach; remove no more than necessary."""
     hands: Literal[1, 2] = 2
     """Number of hands; with 2, one may hold an object while the other lifts one."""
+    gripper: Annotated[
+        GripperKind | None, options.one_of(GripperKind), options.default_of("gripper.kind")
+    ] = None
+    """Offer only lifts with a grasp on a free path; dimensions are the settings `gripper.*`."""
     risk: Annotated[float | None, options.default_of("rehearsal.risk", "P")] = None
     """Maximum probability that a lift moves another object."""
     views: Annotated[options.OptionalCount, options.default_of("active.max_views")] = None
@@ -276,7 +281,7 @@ class Clear(options.ExploringCommand):
 
     def config(self) -> Config:
         """All settings."""
-        given = {"active.max_views": self.views, "rehearsal.risk": self.risk}
+        given = {"active.max_views": self.views, "rehearsal.risk": self.risk, "gripper.kind": self.gripper}
         return self.settings.read(given, takes_views=True)
 
     def __call__(self) -> None:

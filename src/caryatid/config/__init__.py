@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from caryatid.config.choices import (
     ExportFormat,
     FusionMethod,
+    GripperKind,
     MaskIdentity,
     NoiseModel,
     Preset,
@@ -22,8 +23,8 @@ from caryatid.runtime import imported_late
 __all__ = [
     "ActiveVisionConfig", "ArmConfig", "CloudConfig", "CompletionConfig", "Config", "EvaluationConfig",
     "ExplanationConfig", "ExportConfig", "ExportFormat", "FitConfig", "FusionConfig", "FusionMethod",
-    "LiftConfig", "MaskConfig", "MaskIdentity", "NoiseConfig", "NoiseModel", "OracleConfig",
-    "PhysicsConfig", "PlausibilityConfig", "Preset", "RecordingConfig", "RegistrationConfig",
+    "GripperConfig", "GripperKind", "LiftConfig", "MaskConfig", "MaskIdentity", "NoiseConfig", "NoiseModel",
+    "OracleConfig", "PhysicsConfig", "PlausibilityConfig", "Preset", "RecordingConfig", "RegistrationConfig",
     "RehearsalConfig", "ReportConfig", "RobotConfig", "SegmentationConfig", "SegmentationMethod",
     "SensorConfig", "SessionConfig", "ShapeKind", "SplitConfig", "SupportConfig", "SurfaceConfig",
     "VoxelConfig",

@@ -16,5 +16,7 @@ NoiseModel = Literal["none", "carmine"]
 """Noise of the simulated camera."""
 ShapeKind = Literal["box", "cylinder", "sphere"]
 """The primitives."""
+GripperKind = Literal["none", "parallel", "suction"]
+"""Grippers; with none, every object can be grasped."""
 ExportFormat = Literal["mjcf", "urdf", "gltf", "graphml", "dot"]
 """Export formats of a scene model."""

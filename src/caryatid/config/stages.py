@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 
-from caryatid.config.choices import FusionMethod, MaskIdentity, ShapeKind
+from caryatid.config.choices import FusionMethod, GripperKind, MaskIdentity, ShapeKind
 
 CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
@@ -636,6 +636,32 @@ class RehearsalConfig:
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
+class GripperConfig:
+    """The gripper that lifts; its dimensions are those of a common wide two-finger gripper."""
+
+    kind: GripperKind = "none"
+    """Parallel jaw or suction disc; with none, every object can be grasped."""
+    opening: Positive = 0.14
+    """Maximum opening of a parallel jaw [m]."""
+    finger: Positive = 0.014
+    """Thickness of a finger along the closing direction, and half of its breadth [m]."""
+    length: Positive = 0.06
+    """Length of the fingers, or of the tube behind the disc [m]."""
+    hand: Positive = 0.08
+    """Breadth and length of the hand behind them [m]."""
+    disc: Positive = 0.015
+    """Radius of a suction disc [m]."""
+    tilt: Acute = 60.0
+    """Maximum angle between approach and straight down [deg]; flatter, the wrist hits the table."""
+    clearance: Positive = 0.005
+    """Minimum distance from other objects, and of an open finger from its object [m]: the error of a fit."""
+    travel: Positive = 0.1
+    """Length of the straight approach, and of the lift along which the gripper touches nothing [m]."""
+    seen: Share = 0.95
+    """Minimum share of the space around the approach that was seen empty [1]; the rest is noise."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
 class Config:
     """All stages."""
 
@@ -659,6 +685,7 @@ class Config:
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     rehearsal: RehearsalConfig = field(default_factory=RehearsalConfig)
+    gripper: GripperConfig = field(default_factory=GripperConfig)
     recording: RecordingConfig = field(default_factory=RecordingConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
     report: ReportConfig = field(default_factory=ReportConfig)

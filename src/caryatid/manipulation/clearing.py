@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 from caryatid.exploration import Explorer, Step, used_up
 from caryatid.graph import TakeStep
+from caryatid.manipulation.grasps import Reachable
 from caryatid.manipulation.order import plan_order
 
 MISSES = 2
@@ -20,14 +22,15 @@ def clear(
     goal: str | None = None,
     hands: int = 2,
     threads: int = 1,
+    reachable: Reachable | None = None,
     past: Iterable[Step] = (),
 ) -> Iterator[Step]:
     """Look until the next lift is safe, lift, and repeat until no object or no safe lift is left.
 
     A lift is safe if no other object moves with a probability above `config.rehearsal.risk`, as in
-    `plan_order`. It is carried out when no view of what it depends on is worth its path, or after
-    `config.active.max_views` views since the previous lift. After each lift the robot looks again, and so
-    detects objects that slid or fell.
+    `plan_order`; with a gripper, it also needs a grasp. It is carried out when no view of what it depends on
+    is worth its path, or after `config.active.max_views` views since the previous lift. After each lift the
+    robot looks again, and so detects objects that slid or fell.
 
     Args:
         explorer: Explorer with a camera and a robot, without a goal.
@@ -35,6 +38,7 @@ def clear(
         goal: Id of the object to reach; None = remove all.
         hands: 2 if another hand can hold one object, else 1.
         threads: Number of parallel rehearsals.
+        reachable: Which gripper poses the arm reaches; None = all.
         past: Steps of a run to continue; their views are reused, and nothing is removed again.
 
     Yields:
@@ -52,7 +56,7 @@ def clear(
             explorer.go()
         explorer.look()
         views += 1
-        lift, reason = _lift(explorer, goal, hands, threads, views)
+        lift, reason = _lift(explorer, goal, hands, threads, views, reachable)
         if lift is not None:
             views, missed = 0, 0 if take(lift) else missed + 1
             explorer.scene.removed(lift.object_id)
@@ -71,26 +75,27 @@ def clear(
 
 
 def _lift(
-    explorer: Explorer, goal: str | None, hands: int, threads: int, views: int
+    explorer: Explorer, goal: str | None, hands: int, threads: int, views: int, reachable: Reachable | None
 ) -> tuple[TakeStep | None, str | None]:
     """The object to remove now, or None to look again; and why this is the last view, or None."""
     scene = explorer.scene
     ids = [o.id for o in scene.graph.objects if o.role == "object"]
     if not ids and goal is None:
         return None, "no objects are left"
-    lift = None
+    lift, missing = None, f"{goal} was not found"
     if goal is None or goal in ids:
+        known: Any = {"goal": goal, "hands": hands, "seed": scene.seed, "threads": threads}
         order = plan_order(
-            scene.graph, scene.config, goal=goal, hands=hands, steps=1, seed=scene.seed, threads=threads
+            scene.graph, scene.config, steps=1, voxels=scene.voxels, reachable=reachable, **known
         )
-        lift = order.steps[0]
+        lift, missing = next(iter(order.steps), None), order.refusal
     explorer.goal = lift.object_id if lift is not None and lift.safe else goal
     explorer.plan()
     reason = used_up(views, scene.config.active) or explorer.reason_to_stop()
     if reason is None:
         return None, None
     if lift is None:
-        return None, f"{reason}; {goal} was not found"
+        return None, f"{reason}; {missing}"
     return (lift, None) if lift.safe else (None, f"no lift is safe: {lift.why}")
 
 

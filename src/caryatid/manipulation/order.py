@@ -25,8 +25,10 @@ from numpy.typing import NDArray
 from caryatid.config import Config, LiftConfig
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SceneObject, SupportGraph, TakeStep
+from caryatid.graph import Grasp, SceneObject, SupportGraph, TakeStep
+from caryatid.manipulation.grasps import Blocked, Reachable, find_grasp
 from caryatid.runtime.display import Pictured
+from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.simulation.lifting import ASIDE, Lift, Lifting
 from caryatid.simulation.world import TABLE, Body, add_body, empty_spec, quaternion, strayed
 from caryatid.support.plausibility import drawn, reconcile
@@ -71,28 +73,33 @@ def plan_order(
     steps: int | None = None,
     seed: int = 0,
     threads: int = 1,
+    voxels: VoxelMap | None = None,
+    reachable: Reachable | None = None,
 ) -> Order:
     """Find a safe order in which to remove all objects, or to reach one.
 
     Greedy: the next object is one whose lift disturbs another with a probability of at most
     `rehearsal.risk`; objects that support nothing come first, and higher ones before lower ones. If no lift
     is safe, the other hand holds the object that would be disturbed most. If that does not help either, the
-    least risky lift is chosen, and the order is not safe.
+    least risky lift is chosen, and the order is not safe. With a gripper (`gripper.kind`), only objects that
+    it can grasp are lifted; the order ends where there are none.
 
     Args:
         graph: The extracted graph.
-        config: Settings of lifts and rehearsals.
+        config: Settings of lifts, rehearsals and the gripper.
         goal: Id of the object to reach; only objects in its way are removed.
         hands: 2 if another hand can hold one object, else 1.
         steps: Maximum number of steps; None = all.
         seed: Seed of the rehearsals.
         threads: Number of parallel rehearsals.
+        voxels: What was seen empty, for the gripper's path; None = only known shapes are in its way.
+        reachable: Which gripper poses the arm reaches; None = all.
 
     Raises:
         InputError: The graph has no support surface, no objects, or more than `rehearsal.max_objects`; or
             the goal is unknown.
     """
-    rehearsal = _Rehearsal(graph, config or Config(), seed, threads)
+    rehearsal = _Rehearsal(graph, config or Config(), seed, threads, voxels, reachable)
     if goal is not None and goal not in rehearsal.ids:
         raise InputError(goal, "is not an object of the graph", f"known objects: {', '.join(rehearsal.ids)}")
     found: list[TakeStep] = []
@@ -100,9 +107,12 @@ def plan_order(
     while len(found) != steps and (left := rehearsal.left()) and (goal is None or goal in left):
         wanted = _in_turn(rehearsal) if goal is None else _on_the_way(goal, rehearsal)
         trial, tried = _safest(rehearsal, wanted, hands)
+        if trial is None:
+            refusal = refusal or _out_of_grasp(rehearsal, wanted)
+            break
         if trial.risk > rehearsal.accepted and not refusal:
             refusal = _refusal(trial, tried)
-        found.append(_step(graph, trial, left, rehearsal.accepted))
+        found.append(_step(rehearsal, trial, left))
         rehearsal.take(trial)
     return Order(tuple(found), refusal)
 
@@ -120,9 +130,13 @@ def _in_turn(rehearsal: _Rehearsal) -> list[str]:
 
 
 def _on_the_way(goal: str, rehearsal: _Rehearsal) -> list[str]:
-    """The goal if it can be lifted; otherwise the objects its lift disturbs, and so on, the nearest first."""
+    """The goal if it can be lifted; otherwise what obstructs or loses by it, and so on, the nearest first."""
     found = [goal]
     for object_id in found:
+        grasp = rehearsal.grasp(object_id)
+        if isinstance(grasp, Blocked):
+            found += [i for i in grasp.by if i in rehearsal.ids and i not in found]
+            continue
         trial = rehearsal.try_lift(object_id)
         if trial.risk <= rehearsal.accepted:
             return [object_id]
@@ -130,14 +144,21 @@ def _on_the_way(goal: str, rehearsal: _Rehearsal) -> list[str]:
     return found
 
 
-def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_Trial, list[_Trial]]:
-    """The first safe lift, with one hand before two, or else the least risky; and those tried before."""
+def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_Trial | None, list[_Trial]]:
+    """The first safe lift, with one hand before two, or else the least risky; and those tried before.
+
+    None if no object can be grasped.
+    """
     tried: list[_Trial] = []
     for object_id in wanted:
+        if isinstance(rehearsal.grasp(object_id), Blocked):
+            continue
         trial = rehearsal.try_lift(object_id)
         if trial.risk <= rehearsal.accepted:
             return trial, tried
         tried.append(trial)
+    if not tried:
+        return None, tried
     tried.sort(key=lambda t: (t.risk, len(t.harmed)))
     best = tried[0]
     # The other hand holds one of those that were disturbed, the most often first.
@@ -151,13 +172,30 @@ def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_
     return best, tried
 
 
-def _step(graph: SupportGraph, trial: _Trial, left: Sequence[str], accepted: float) -> TakeStep:
-    carried = [s.supported for s in graph.supports if s.supporter == trial.object_id and s.supported in left]
+def _step(rehearsal: _Rehearsal, trial: _Trial, left: Sequence[str]) -> TakeStep:
+    carried = [
+        s.supported
+        for s in rehearsal.graph.supports
+        if s.supporter == trial.object_id and s.supported in left
+    ]
     what = f"supports {', '.join(carried)}" if carried else "supports no remaining object"
     with_hold = f" while {', '.join(trial.hold)} is held" if trial.hold else ""
     worst = ", ".join(f"{i} with probability {share:.2f}" for i, share in trial.harmed.items())
     why = f"it {what}; lifting it{with_hold} disturbed {worst or 'nothing'} in {trial.rehearsals} rehearsals"
-    return TakeStep(trial.object_id, trial.hold, trial.risk <= accepted, trial.risk, why)
+    grasp, safe = rehearsal.grasp(trial.object_id), trial.risk <= rehearsal.accepted
+    assert not isinstance(grasp, Blocked)
+    if grasp is not None:
+        lean = np.degrees(np.arccos(np.clip(-grasp.T_world_gripper[2, 2], -1.0, 1.0)))
+        across = f" across {1e3 * grasp.width:.0f} mm" if grasp.width else ""
+        why += f"; the gripper grasps it{across}, {lean:.0f}° from straight down"
+    return TakeStep(trial.object_id, trial.hold, safe, trial.risk, why, grasp)
+
+
+def _out_of_grasp(rehearsal: _Rehearsal, wanted: Sequence[str]) -> str:
+    """Say why the gripper can grasp none of some objects."""
+    grasps = ((i, rehearsal.grasp(i)) for i in wanted)
+    reasons = "; ".join(f"{i}: {grasp.why}" for i, grasp in grasps if isinstance(grasp, Blocked))
+    return f"no object can be grasped: {reasons}"
 
 
 def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
@@ -186,7 +224,15 @@ class _Trial:
 class _Rehearsal:
     """Scenes in which to try lifts, drawn when they are needed."""
 
-    def __init__(self, graph: SupportGraph, config: Config, seed: int, threads: int) -> None:
+    def __init__(
+        self,
+        graph: SupportGraph,
+        config: Config,
+        seed: int,
+        threads: int,
+        voxels: VoxelMap | None,
+        reachable: Reachable | None,
+    ) -> None:
         if graph.support_surface is None:
             raise InputError("graph", "has no support surface", "give a graph with a table")
         self.ids = tuple(o.id for o in graph.objects if o.role == "object")
@@ -203,6 +249,8 @@ class _Rehearsal:
         self._scenes: list[_DrawnScene] = []
         self._trials: dict[tuple[str, ...], _Trial] = {}
         self._taken: list[_Trial] = []
+        self._voxels, self._reachable = voxels, reachable
+        self._grasps: dict[str, Grasp | Blocked] = {}
 
     def left(self) -> list[str]:
         """Ids of the objects that have not been removed yet."""
@@ -220,6 +268,24 @@ class _Rehearsal:
         if asked not in self._trials:
             self._trials[asked] = self._tried(object_id, tuple(hold))
         return self._trials[asked]
+
+    def grasp(self, object_id: str) -> Grasp | Blocked | None:
+        """How the gripper takes hold of a remaining object, or why it cannot; None without a gripper."""
+        if self._config.gripper.kind == "none":
+            return None
+        if object_id not in self._grasps:
+            gone = {trial.object_id for trial in self._taken} | {object_id}
+            others = {o.id: o.shape for o in self.graph.objects if o.id not in gone}
+            friction = self._config.support.friction[0]
+            self._grasps[object_id] = find_grasp(
+                self.graph[object_id].shape,
+                others,
+                self._config.gripper,
+                friction,
+                voxels=self._voxels,
+                reachable=self._reachable,
+            )
+        return self._grasps[object_id]
 
     def _tried(self, object_id: str, hold: tuple[str, ...]) -> _Trial:
         # An object held in a scene because it does not stay there moves if it loses a support.
@@ -245,6 +311,7 @@ class _Rehearsal:
         self._each(lambda scene: scene.take(trial.object_id, trial.hold), slice(0, len(self._scenes)))
         self._taken.append(trial)
         self._trials.clear()
+        self._grasps.clear()
 
     def _draw(self, number: int) -> _DrawnScene:
         scene = _DrawnScene(self.graph, self.ids, number, self._config, self._seed)
