@@ -351,6 +351,18 @@ class TestCommands:
             assert (document["success"], document["stop"]) == (True, f"{goal} is removed")
             assert [step["object"] for step in document["steps"]] == taken
 
+    def test_a_gripper_waits_until_its_path_is_seen(self, scene_file, tmp_path, capsys):
+        """Above the table there is nothing to read a depth from, so that space stays unknown."""
+        for seen, taken in ((0.95, []), (0.0, ["o2", "o1"])):
+            out = tmp_path / str(seen)
+            command = ["clear", scene_file, "--goal", "o1", "--gripper", "suction", "--out", out, "--json"]
+            command += ["--no-report", f"--set=gripper.seen={seen}"]
+            assert run_command(*command, *SMALL, *QUICK) == 0
+            document = json.loads(capsys.readouterr().out)
+            assert [step["object"] for step in document["steps"]] == taken
+            assert all(0.0 <= step["grasp"]["seen_free"] < 0.95 for step in document["steps"])
+            assert ("was not seen empty" in document["stop"]) == (not taken)
+
     def test_a_recording_cannot_be_cleared(self, recording, capsys, leftovers):
         assert run_command("clear", recording, *QUICK, "--quiet") == 1
         assert "cannot be simulated" in capsys.readouterr().err

@@ -97,7 +97,7 @@ def test_a_shape_that_the_table_would_fill_is_not_taken(models, table, kind):
     shown = np.where(observation.cloud.points_world[:, 2] > 0.83, 1, 0).astype(np.int32)
     observation = observation.with_labels(shown)
     models.fit_all(models.add(observation, 0))
-    feet = observation.beneath(surface_at(table), Config().explanation.spacing)
+    feet = observation.footprint(surface_at(table), Config().explanation.spacing)
     models.form({1}, VoxelMap.around(np.array([0.0, 0.0, 0.75]), Config().voxels), feet)
     assert models.objects()[0].shape.kind == kind
 

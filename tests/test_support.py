@@ -20,7 +20,7 @@ from caryatid.geometry.shapes import Box, Cylinder, Sphere, Uncertainty
 from caryatid.geometry.transforms import rigid
 from caryatid.graph import SceneObject
 from caryatid.support.contacts import find_contacts, find_gap
-from caryatid.support.equilibrium import hold
+from caryatid.support.equilibrium import support_forces
 from caryatid.support.plausibility import closing, drawn, reconcile
 from caryatid.support.relations import explain, infer, predict_removal
 from caryatid.support.stability import assess, contact_patch, ground_outline
@@ -388,7 +388,7 @@ class TestInfer:
             # Rounding decides a draw in which a force lies at the threshold.
             heap = scene(*random_shapes(7, rng, 0.1))
             shares, others = (
-                hold(objects, CONFIG, np.random.default_rng(0)).shares
+                support_forces(objects, CONFIG, np.random.default_rng(0)).shares
                 for objects in (heap, about_vertical(heap, motion_about_vertical(rng)))
             )
             assert np.abs(shares - others).max() <= 2.01 / CONFIG.draws

@@ -485,7 +485,7 @@ class Scene(Pictured):
             self._models.fit_newest(set(observation.shown) - {0, SUPPORT_LABEL}, voxels)
             return observation
         self._models.fit_all(shown, voxels)
-        table = observation.beneath(surface, self.config.explanation.spacing)
+        table = observation.footprint(surface, self.config.explanation.spacing)
         if named:
             self._models.form(shown, voxels, table)
             return observation

@@ -64,7 +64,7 @@ class Observation:
         """Return the observation with other labels (N,)."""
         return replace(self, cloud=replace(self.cloud, labels=labels))
 
-    def beneath(self, surface: SupportSurface, spacing: float) -> Array:
+    def footprint(self, surface: SupportSurface, spacing: float) -> Array:
         """Places (M, 3) of the surface straight below points of objects, one per square of a spacing [m]."""
         points = self.cloud.points_world[(self.labels != 0) & (self.labels != SUPPORT_LABEL)]
         feet = points - surface.height(points)[:, None] * surface.normal_world

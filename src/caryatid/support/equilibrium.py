@@ -32,8 +32,8 @@ _SMOOTH = 1e-4
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Holding:
-    """What holds what, over draws of a scene of N objects.
+class SupportForces:
+    """Which object supports which, and by what force, over draws of a scene of N objects.
 
     Attributes:
         shares: Share (N, N) of draws in which each object supports each other one [1].
@@ -51,7 +51,9 @@ class Holding:
     areas: Sequence[Array]
 
 
-def hold(objects: Sequence[SceneObject], config: SupportConfig, rng: np.random.Generator) -> Holding:
+def support_forces(
+    objects: Sequence[SceneObject], config: SupportConfig, rng: np.random.Generator
+) -> SupportForces:
     """Find out how often objects support each other, in draws of the unknowns.
 
     A supports B in a draw if it carries more than a small share of B's weight, or if it presses on B, which
@@ -83,13 +85,13 @@ def hold(objects: Sequence[SceneObject], config: SupportConfig, rng: np.random.G
         total += trust
         alike += draw.likeness >= 0.5
     shares = (held / total).clip(0.0, 1.0)
-    return Holding(shares, forces / total[:, None], alike / config.draws, scene.contacts, scene.areas)
+    return SupportForces(shares, forces / total[:, None], alike / config.draws, scene.contacts, scene.areas)
 
 
 def moved_without(
     objects: Sequence[SceneObject], index: int, config: SupportConfig, rng: np.random.Generator
 ) -> Array:
-    """Probability (N,) that each object moves when one is removed [1]; arguments as of `hold`."""
+    """Probability (N,) that each object moves when one is removed [1]; arguments as of `support_forces`."""
     scene, moves = Equilibrium(objects, config), np.zeros(len(objects))
     total = np.zeros(len(objects))
     for draw in scene.draws(rng):

@@ -14,7 +14,7 @@ from caryatid.geometry import polygons
 from caryatid.geometry.transforms import Array
 from caryatid.graph import CERTAIN, LIKELY, Kind, SceneObject, Stability, Support, SupportGraph
 from caryatid.support.contacts import Contact, find_gap
-from caryatid.support.equilibrium import hold, moved_without, touching
+from caryatid.support.equilibrium import moved_without, support_forces, touching
 from caryatid.support.stability import assess
 
 
@@ -83,7 +83,7 @@ def infer(
     ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
     if config.stability == "area":
         return _by_area(ordered, config)
-    found = hold(ordered, config, rng or np.random.default_rng(0))
+    found = support_forces(ordered, config, rng or np.random.default_rng(0))
     supports = [
         _support(t, ordered[b], float(found.shares[a, b]), found.forces[a, b], config)
         for (a, b), t in sorted(_touches(ordered, found.contacts).items())
@@ -128,7 +128,7 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
         return f"{head}: they do not touch, {_gap(gap)}."
     if config.stability == "area":
         return f"{head}: it is not below it ({touch})."
-    share = hold(graph.objects, config, np.random.default_rng(0)).shares[a, b]
+    share = support_forces(graph.objects, config, np.random.default_rng(0)).shares[a, b]
     return f"{head}: {supported} rests without it ({touch}). Probability {share:.2f}."
 
 
@@ -209,7 +209,7 @@ def _support(
     a, b = t.other.id, o.id
     kind: Kind = "lean" if t.tilt < 180.0 - config.max_tilt else "top-down"
     kind = "bottom-up" if t.tilt <= config.max_tilt else kind
-    weight = "" if force is None else f" with {100.0 * np.linalg.norm(force):.0f} % of its weight"
+    weight = "" if force is None else f" with {np.linalg.norm(force):.2f} times its weight"
     why = {
         "bottom-up": f"{b} rests on {a}{weight} ({t}).",
         "lean": f"{b} leans on {a}{weight} ({t}).",
