@@ -658,7 +658,7 @@ class GripperConfig:
     travel: Positive = 0.1
     """Length of the straight approach, and of the lift along which the gripper touches nothing [m]."""
     seen: Share = 0.95
-    """Minimum share of the space around the approach that was seen empty [1]; the rest is noise."""
+    """Minimum share of the space that the gripper approaches through, seen empty [1]; the rest is noise."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

@@ -2,8 +2,8 @@
 
 A parallel jaw grasps between two antipodal points: the line between them is within the friction cones of
 both (Nguyen, 1988). A suction disc grasps where the surface is flat. The gripper moves straight along its
-approach, and then lifts the object straight up. Its fingers and its hand keep clear of all known shapes, and
-pass only through space that was seen empty.
+approach, and then lifts the object straight up. Its fingers and its hand keep clear of all known shapes on
+both ways, and approach through space that was seen empty.
 """
 
 from __future__ import annotations
