@@ -76,6 +76,17 @@ def _interrupt_again(lost: sys.UnraisableHookArgs) -> None:
         sys.__unraisablehook__(lost)
 
 
+def _catch_signals() -> None:
+    """Make SIGTERM, SIGHUP and repeated interrupts raise KeyboardInterrupt."""
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, signal.default_int_handler)
+        sys.unraisablehook = _interrupt_again
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
+
+
 def run_from_shell() -> NoReturn:
     """Run the command line and exit with its status.
 
@@ -85,14 +96,12 @@ def run_from_shell() -> NoReturn:
         stream = getattr(sys, name) or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
         stream.reconfigure(errors="backslashreplace")  # JSON and TOML read these escapes
         setattr(sys, name, stream)
-    for name in ("SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)
-        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, signal.default_int_handler)
-    if hasattr(signal, "setitimer"):
-        signal.signal(signal.SIGALRM, signal.default_int_handler)
-        sys.unraisablehook = _interrupt_again
-    status = main()
+    try:
+        _catch_signals()
+        status = main()
+    except KeyboardInterrupt:  # before `main` began or after it ended
+        sys.stderr.write("interrupted: nothing was written\n")
+        status = INTERRUPTED
     if status == INTERRUPTED:
         # Do not make the user wait for threads and libraries to end.
         sys.stderr.flush()
