@@ -1,10 +1,12 @@
-"""Is any view lost that was acknowledged? Processes killed at random moments, and eight clients at once.
+"""Is anything lost that was acknowledged? Commands killed at random moments, and clients under load.
 
-    python benchmarks/durability.py [--kills 200] [--views 200]
+    python benchmarks/durability.py [--only runs load] [--kills 200] [--views 1000] [--clients 50]
 
-`caryatid session add` and `caryatid serve` are killed; after each kill the session is opened and its graph
-compared with that of the same views without any kill. Then clients put load on a service. An `AssertionError`
-says that a view was lost, or that a session does not open or is not what its views make it.
+`session add`, `session take` and `serve` are killed; after each kill the session is opened and its graph
+compared with that of the same views without any kill. `explore`, `extract`, `clear`, `benchmark` and the
+first compilation are killed too: what lies there is whole, and the next run continues or replaces it and
+cleans up. Then clients put load on a service, hostile ones among them. An `AssertionError` says what was
+lost.
 """
 
 from __future__ import annotations
@@ -15,25 +17,32 @@ import multiprocessing
 import os
 import random
 import signal
+import socket
+import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from threading import Lock
-from typing import Any
+from threading import Event, Lock, Thread
+from typing import Annotated, Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
 import tyro
 
 from caryatid import cli
+from caryatid.benchmark.store import RESULTS, ResultStore
 from caryatid.config import SensorConfig
 from caryatid.geometry import transforms
+from caryatid.io import write_recording
 from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.images import png
 from caryatid.scene import Scene
@@ -41,6 +50,7 @@ from caryatid.sensing.views import View
 from caryatid.sessions import Session
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
+from caryatid.steps import read_run
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
@@ -48,6 +58,7 @@ from robot_client import RobotClient
 
 SENSOR = SensorConfig(width=160, height=120, focal=131.25)
 """Small images: a view takes a tenth of a second, so that much happens in little time."""
+SMALL = [f"--set=sensor.{name}={value}" for name, value in asdict(SENSOR).items() if value is not None]
 
 FORKS = multiprocessing.get_context("forkserver")  # processes that have imported everything, begun nothing
 FORKS.set_forkserver_preload(["caryatid.sessions.session", "caryatid.cli.sessions", "caryatid.service"])
@@ -256,16 +267,208 @@ def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> 
     return tally
 
 
+def kill_runs(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
+    """Kill `explore` and `extract` over an older run, half of the times while they publish.
+
+    After each kill a run is there, whole, or the next one recovers it; and nothing stays beside it.
+    """
+    chance, tally = random.Random(seed), Counter[str]()
+    write_recording(folder / "recording", views[:2])
+    took: dict[int, float] = {}
+    commands: tuple[list[object], ...] = (
+        ["explore", "tower", "--views", 2, *SMALL],
+        ["extract", folder / "recording"],
+    )
+    for number in range(kills):
+        run, words = folder / f"runs-{number % 2}" / "run", commands[number % 2]
+        words = [*words, "--out", run, "--quiet"]
+        if not run.parent.exists():
+            _finish([*words, "--seed", 0], folder / "said")
+            begun = time.monotonic()
+            _finish([*words, "--seed", 0], folder / "said")
+            took[number % 2] = time.monotonic() - begun
+        process = start([*words, "--seed", number + 1], folder / "said")
+        if number % 4 < 2:
+            process.join(chance.uniform(0.0, 1.1) * took[number % 2])
+        else:
+            pattern = f".partial-{run.name}-*/run.json"
+            _wait_for(partial(_any, run.parent, pattern), 2.0 * took[number % 2])
+            time.sleep(chance.uniform(0.0, 0.01))
+        status = kill(process)
+        assert status in (0, -9), (folder / "said").read_text()
+        tally["ended before" if status == 0 else "killed"] += 1
+        if not run.exists():
+            tally["recovered"] += 1
+            assert cli.main([*map(str, words), "--set=sensor.width=0"]) != 0  # a command that is refused
+        _check_run(run)
+    for number, words in enumerate(commands):
+        run = folder / f"runs-{number}" / "run"
+        _finish([*words, "--out", run, "--quiet", "--seed", kills + 1], folder / "said")
+        assert os.listdir(run.parent) == ["run"], "something stays after the next run"
+        assert _check_run(run) == kills + 1
+    return tally
+
+
+def _any(folder: Path, pattern: str) -> bool:
+    return any(folder.glob(pattern))
+
+
+def _check_run(folder: Path) -> int:
+    """Read a run as a whole; returns its seed."""
+    run = read_run(folder)
+    assert len(run.views) == len(run.record["steps"])
+    assert all(view.load_labels().any() for view in run.views)
+    return int(run.record["seed"])
+
+
+def kill_clearing(folder: Path, _: Sequence[View], kills: int, seed: int) -> Counter[str]:
+    """Kill `clear` at random moments; the same command continues, and ends as it does without any kill."""
+    chance, tally = random.Random(seed), Counter[str]()
+    words = ["clear", "tower", "--no-report", "--hands", 1, "--quiet", *SMALL, "--out"]
+    begun = time.monotonic()
+    _finish([*words, folder / "whole"], folder / "said")
+    took, whole = time.monotonic() - begun, read_run(folder / "whole")
+    run, known = folder / "runs" / "run", 0
+    while tally["killed"] < kills:
+        process = start([*words, run], folder / "said")
+        process.join(chance.uniform(0.0, 0.6) * took)
+        status = kill(process)
+        assert status in (0, -9), (folder / "said").read_text()
+        tally["killed" if status else "ended"] += 1
+        found = len(read_run(run).views) if run.exists() else 0
+        assert found >= known, "views that were kept are lost"
+        known = found
+        if status == 0:
+            assert os.listdir(run.parent) == ["run"], "something stays after the run"
+            assert read_run(run).record["lifts"] == whole.record["lifts"], "it ended differently"
+            run, known = folder / f"runs-{tally['ended']}" / "run", 0
+    return tally
+
+
+def kill_benchmark(folder: Path, _: Sequence[View], kills: int, seed: int) -> Counter[str]:
+    """Kill a benchmark and its workers at random moments; finished episodes stay, and none is done twice."""
+    chance, tally, out, known = random.Random(seed), Counter[str](), folder / "out", 0
+    words = ["benchmark", "--suite=smoke", "--scenes=tower", "--planner=random", "--views=2", "--jobs=2"]
+    command = [sys.executable, "-m", "caryatid", *words, f"--out={out}", *SMALL]
+    for number in range(kills + 1):
+        seeds = f"--seeds={4 * (kills if number == kills else number + 1)}"
+        process = subprocess.Popen([*command, seeds, "--quiet"], start_new_session=True)
+        if number == kills:
+            assert process.wait() == 0
+        else:
+            time.sleep(chance.uniform(0.5, 6.0))
+            tally["killed" if process.poll() is None else "ended before"] += 1
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        if (out / RESULTS).exists():
+            with ResultStore(out / RESULTS) as store:
+                assert len(store.outcomes) >= known, "a finished episode is lost"
+                known = len(store.outcomes)
+    keys = [line["key"] for line in map(json.loads, (out / RESULTS).open()) if "key" in line]
+    assert len(keys) == len(set(keys)) == 4 * kills, "an episode is missing or done twice"
+    return tally
+
+
+def kill_compiling(folder: Path, _: Sequence[View], kills: int, seed: int) -> Counter[str]:
+    """Kill the first compilation at random moments; no compiler outlives it, and the last one ends soon."""
+    chance, tally = random.Random(seed), Counter[str]()
+    code = "from caryatid.runtime.compiling import compile_kernels; compile_kernels()"
+    for number in range(kills + 1):
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / f"kernels-{number // 5}")}
+        begun = time.monotonic()
+        process = subprocess.Popen([sys.executable, "-c", code], env=environment)
+        if number == kills:
+            assert process.wait() == 0
+            tally["seconds of the last one"] = round(time.monotonic() - begun)
+            assert not list(folder.rglob("compiling/*")), "a folder of locks stays"
+            continue
+        time.sleep(chance.uniform(0.5, 15.0))
+        tally["killed" if process.poll() is None else "ended before"] += 1
+        process.kill()
+        process.wait()
+        _wait_for(lambda: not _processes_of(str(folder)), 5.0)
+        assert not _processes_of(str(folder)), "a compiler outlives its command"
+    return tally
+
+
+def _processes_of(text: str) -> list[int]:
+    """Processes with a text in their command line."""
+    return [p.pid for p in psutil.process_iter(["cmdline"]) if text in " ".join(p.info["cmdline"] or ())]
+
+
+def _finish(arguments: Sequence[object], said: Path) -> None:
+    """Run a command to its end."""
+    process = start(arguments, said)
+    process.join()
+    assert process.exitcode == 0, said.read_text()
+
+
+def _wait_for(condition: Callable[[], bool], seconds: float) -> None:
+    """Wait until a condition holds, or for so long."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and not condition():
+        time.sleep(0.0005)
+
+
+@contextmanager
+def hostile_clients(address: str, count: int) -> Iterator[Counter[str]]:
+    """Have clients send half requests, nonsense and far too much, each as fast as it is answered.
+
+    Yields what they got: statuses, or `closed`.
+    """
+    where, stop, tally = urlsplit(address), Event(), Counter[str]()
+    head = b"POST /sessions/table-0/views HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+    kinds = (
+        b"GET / HT",
+        head + b"Content-Length: 100000000000\r\n\r\n{",
+        head + b"Content-Length: 50\r\n\r\n{",
+        head + b"Content-Length: 7\r\n\r\n[[[[[[[",
+        head + b'Content-Length: 14\r\n\r\n{"depth": null}',
+        head + b"Transfer-Encoding: chunked\r\n\r\nffffffff\r\n",
+        b"GET /sessions/..%2f..%2fetc/graph HTTP/1.1\r\nHost: x\r\n\r\n",
+        bytes(range(256)) * 20,
+    )
+
+    def send(number: int) -> None:
+        chance = random.Random(number)
+        while not stop.is_set():
+            try:
+                with socket.create_connection((where.hostname, where.port), 10.0) as open_one:
+                    open_one.settimeout(10.0)
+                    open_one.sendall(chance.choice(kinds))
+                    answer = open_one.recv(64)
+                tally[answer[9:12].decode("latin-1") or "closed"] += 1
+            except OSError:
+                tally["closed"] += 1
+            stop.wait(0.05)
+
+    threads = [Thread(target=send, args=(number,), daemon=True) for number in range(count)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield tally
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join(20.0)
+
+
 def put_load(
-    folder: Path, views: Sequence[View], *, clients: int, sessions: int, options: Sequence[object] = ()
-) -> tuple[dict[str, list[int]], list[float], list[float]]:
+    folder: Path,
+    views: Sequence[View],
+    *,
+    clients: int,
+    sessions: int,
+    hostile: int = 0,
+    options: Sequence[object] = (),
+) -> tuple[dict[str, list[int]], list[float], list[float], Counter[str]]:
     """Have clients add views to sessions of a service, each view once, as fast as they can.
 
     View n goes to session n modulo their number; client n adds every n-th view.
 
     Returns:
         Of each session which of the views each of its views is; how long each answer took [s]; the memory of
-        the service after each answer [MB].
+        the service after each answer [MB]; what hostile clients were answered.
     """
     names = [f"table-{n}" for n in range(sessions)]
     orders: dict[str, list[int]] = {name: [] for name in names}
@@ -288,7 +491,7 @@ def put_load(
             seconds.append(time.monotonic() - begun)
             memory.append(watched.memory_info().rss / 1e6)
 
-    with ThreadPoolExecutor(clients) as threads:
+    with hostile_clients(robot.address, hostile) as answers, ThreadPoolExecutor(clients) as threads:
         list(threads.map(work, range(clients)))
     found = {name: (robot.views(name), robot.graph(name)) for name in names}
     assert service.pid is not None
@@ -300,37 +503,72 @@ def put_load(
         for number in order:
             scene.update(views[number])
         assert found[name] == (len(order), graph_to_json(scene.graph)), "a view is lost, or the graph differs"
-    return orders, seconds, memory
+    assert not [status for status in answers if status.startswith("5") and status != "503"], answers
+    return orders, seconds, memory, answers
 
 
-def main(*, kills: int = 200, seed: int = 0, views: int = 200, clients: int = 8, sessions: int = 4) -> None:
-    """Kill and put load, and say what became of the views.
+KILLS: dict[str, Callable[[Path, Sequence[View], int, int], Counter[str]]] = {
+    "add": kill_adding,
+    "take": kill_taking,
+    "serve": kill_serving,
+    "runs": kill_runs,
+    "clear": kill_clearing,
+    "benchmark": kill_benchmark,
+    "compile": kill_compiling,
+}
+
+
+def main(
+    *,
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME…")] = (),
+    kills: int = 200,
+    seed: int = 0,
+    views: int = 1000,
+    clients: int = 50,
+    hostile: int = 10,
+    sessions: int = 8,
+) -> None:
+    """Kill commands and put load on a service, and say what became of what was acknowledged.
 
     Args:
-        kills: Kills of each of the two.
+        only: Any of add, take, serve, runs, clear, benchmark, compile, load.
+        kills: Kills of each of `add`, `take` and `serve`; half as many of `runs`, a quarter of `clear` and
+            `benchmark`, a tenth of `compile`.
         seed: Seed of the moments.
         views: Views of the load.
         clients: Clients that put it.
+        hostile: Clients that send nonsense meanwhile.
         sessions: Sessions they add to; the service keeps four open.
     """
     around = views_around("clutter", max(12, views))
-    for what, kill_some in (("session add", kill_adding), ("serve", kill_serving)):
-        begun = time.monotonic()
+    for what, kill_some in KILLS.items():
+        if only and what not in only:
+            continue
+        begun, share = time.monotonic(), {"runs": 2, "clear": 4, "benchmark": 4, "compile": 10}.get(what, 1)
         with TemporaryDirectory() as folder:
-            tally = kill_some(Path(folder), around[:12], kills, seed)
+            tally = kill_some(Path(folder), around[:12], kills // share, seed)
         figures = ", ".join(f"{count} {name}" for name, count in sorted(tally.items()))
-        print(f"{what}: {figures}; none lost ({time.monotonic() - begun:.0f} s)", flush=True)
+        print(f"{what}: {figures}; nothing lost ({time.monotonic() - begun:.0f} s)", flush=True)
+    if only and "load" not in only:
+        return
     begun, limit = time.monotonic(), ("--open-sessions", 4)
     with TemporaryDirectory() as folder:
-        _, seconds, memory = put_load(
-            Path(folder), around[:views], clients=clients, sessions=sessions, options=limit
+        _, seconds, memory, answers = put_load(
+            Path(folder),
+            around[:views],
+            clients=clients,
+            sessions=sessions,
+            hostile=hostile,
+            options=limit,
         )
     seconds.sort()
+    level = [max(memory[k * views // 5 : (k + 1) * views // 5]) for k in range(5)]
     print(
         f"{views} views, {clients} clients, {sessions} sessions: none lost, graphs equal, "
         f"{views / (time.monotonic() - begun):.1f} views/s; view and next view "
         f"{seconds[len(seconds) // 2]:.2f} s in the median, at most {seconds[-1]:.2f} s; "
-        f"memory {memory[0]:.0f} to {memory[-1]:.0f} MB"
+        f"memory, highest of each fifth: {', '.join(f'{m:.0f}' for m in level)} MB; "
+        f"{hostile} hostile clients got {dict(sorted(answers.items()))}"
     )
 
 

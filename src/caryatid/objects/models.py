@@ -270,6 +270,9 @@ class ObjectModels:
             kept = np.flatnonzero(segments)
             kept = kept[thin(points[kept], self._config.explanation.spacing)]
             self._segments.append((cKDTree(points[kept]), labels[kept]))
+            if len(self._segments) > 2 * self._config.cloud.depth:  # as far back as points are kept
+                del self._segments[0]
+                self._owners = {k: (cloud, rows[1:]) for k, (cloud, rows) in self._owners.items()}
         named = associate(
             points,
             segments,
@@ -480,9 +483,10 @@ class ObjectModels:
         return self._owners[label][1]
 
     def _forget(self, labels: set[int]) -> None:
-        """Drop the results of earlier splits and merges for objects that have changed."""
+        """Drop what earlier splits and merges found out about objects that have changed."""
         self._undivided = {k: n for k, n in self._undivided.items() if k not in labels}
         self._apart = {pair: n for pair, n in self._apart.items() if not labels & set(pair)}
+        self._owners = {k: known for k, known in self._owners.items() if k not in labels}
 
     def _noise(self) -> float:
         """Standard deviation of points from their surfaces [m]: that of the object in the middle."""
