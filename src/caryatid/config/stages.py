@@ -632,7 +632,8 @@ class RehearsalConfig:
     risk: Share = 0.02
     """Maximum probability that a safe lift moves another object [1]; with 0, no lift is safe."""
     max_objects: Count = 300
-    """Maximum number of objects [1]; MuJoCo reserves 0.6 GB per thread for 300, and 4.7 GB for 1,000."""
+    """Maximum number of objects within 4 cm of each other [1]; MuJoCo reserves 0.6 GB per thread for 300, and
+    4.7 GB for 1,000."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

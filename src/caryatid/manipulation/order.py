@@ -7,23 +7,27 @@ It is held in place, and its supports are taken from the support graph alone.
 
 The risk of a lift is the probability that it disturbs another object in the next scene, such as the real one.
 After n scenes with total harm h, it is (h + ½) / (n + 1): the posterior mean with Jeffreys' prior,
-Beta(½, ½). Scenes are sampled until the risk is low enough, or can no longer become so.
+Beta(½, ½). Scenes are sampled until the risk is low enough, or can no longer become so. Objects that stand
+apart are rehearsed apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import mujoco
 import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from caryatid.config import Config, LiftConfig
 from caryatid.errors import InputError
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Grasp, SceneObject, SupportGraph, TakeStep
 from caryatid.manipulation.grasps import Blocked, Reachable, find_grasp
@@ -123,7 +127,7 @@ def _in_turn(rehearsal: _Rehearsal) -> list[str]:
     Among these, the ones that do not stand in rehearsals come first, because any touch may topple them, and
     then the highest.
     """
-    left, graph, unstable = rehearsal.left(), rehearsal.graph, rehearsal.unstable()
+    left, graph, unstable = rehearsal.left(), rehearsal.graph, rehearsal.unstable
     carrying = {s.supporter for s in graph.supports if s.supported in left}
     height = {o.id: float(o.centre_world[2]) for o in graph.objects}
     return sorted(left, key=lambda i: (i in carrying, -unstable[i], -height[i], i))
@@ -238,15 +242,19 @@ class _Rehearsal:
         self.ids = tuple(o.id for o in graph.objects if o.role == "object")
         if not self.ids:
             raise InputError("graph", "has no objects", "give a graph with objects to remove")
-        if len(self.ids) > config.rehearsal.max_objects:
-            reserved = 0.6 * (len(self.ids) / 300) ** 1.7  # two arenas [GB], measured with 300 and 1,000
+        self._groups = _groups([graph[i].shape for i in self.ids], 2.0 * config.lift.moved)
+        largest = int(np.bincount(self._groups).max())
+        if largest > config.rehearsal.max_objects:
+            reserved = 0.6 * (largest / 300) ** 1.7  # two arenas [GB], measured with 300 and 1,000
             reason = (
-                f"has {len(self.ids)} objects, for which MuJoCo reserves about {reserved:.1f} GB per thread"
+                f"has {largest} objects close together, for which MuJoCo reserves "
+                f"about {reserved:.1f} GB per thread"
             )
             raise InputError("graph", reason, "raise rehearsal.max_objects, or give a part of the scene")
         self.graph, self._config, self._seed, self._threads = graph, config, seed, threads
         self.accepted = config.rehearsal.risk
-        self._scenes: list[_DrawnScene] = []
+        self._bodies: list[dict[str, Body]] = []
+        self._scenes: dict[int, list[_DrawnScene]] = {group: [] for group in self._groups.tolist()}
         self._trials: dict[tuple[str, ...], _Trial] = {}
         self._taken: list[_Trial] = []
         self._voxels, self._reachable = voxels, reachable
@@ -257,10 +265,14 @@ class _Rehearsal:
         taken = {trial.object_id for trial in self._taken}
         return [i for i in self.ids if i not in taken]
 
+    @cached_property
     def unstable(self) -> dict[str, float]:
         """Shares of the first scenes in which each object does not stay in place, by id."""
-        found = self._each(lambda scene: scene.unstable, slice(0, BATCH))
-        return dict(zip(self.ids, np.mean(found, axis=0).tolist(), strict=True))
+        unstable: dict[str, float] = {}
+        for group in self._scenes:
+            found = self._each(group, lambda scene: scene.unstable, slice(0, BATCH))
+            unstable |= zip(self._near(group), np.mean(found, axis=0).tolist(), strict=True)
+        return unstable
 
     def try_lift(self, object_id: str, hold: Collection[str] = ()) -> _Trial:
         """Lift an object while others are held, in as many scenes as needed; cached, and nothing changes."""
@@ -290,52 +302,86 @@ class _Rehearsal:
     def _tried(self, object_id: str, hold: tuple[str, ...]) -> _Trial:
         # An object held in a scene because it does not stay there moves if it loses a support.
         free = set(self.left()) - set(hold)
-        supports = [self.graph.support(object_id, i) if i in free else None for i in self.ids]
+        group = self._group_of(object_id)
+        ids = self._near(group)
+        supports = [self.graph.support(object_id, i) if i in free else None for i in ids]
         loses = np.array([0.0 if s is None else s.belief for s in supports])
         accepted, most = self.accepted, self._config.rehearsal.draws
-        harm, harms, risk = np.zeros((0, len(self.ids))), 0.5, 1.0
+        harm, harms, risk = np.zeros((0, len(ids))), 0.5, 1.0
         while not len(harm) or (len(harm) < most and risk > accepted >= harms / (most + 1.0)):
             scenes = slice(len(harm), len(harm) + BATCH)
             found = self._each(
-                lambda s: np.maximum(s.lift(object_id, hold).disturbed, s.unstable * loses), scenes
+                group, lambda s: np.maximum(s.lift(object_id, hold).disturbed, s.unstable * loses), scenes
             )
             harm = np.concatenate([harm, found])
             harms = float((1.0 - np.prod(1.0 - harm, axis=1)).sum()) + 0.5
             risk = harms / (len(harm) + 1.0)
-        shares = zip(self.ids, harm.mean(axis=0).tolist(), strict=True)
+        shares = zip(ids, harm.mean(axis=0).tolist(), strict=True)
         harmed = {i: share for i, share in shares if share > 0.0}
         return _Trial(object_id, hold, len(harm), risk, harmed)
 
     def take(self, trial: _Trial) -> None:
         """Continue without an object whose lift was tried; others that moved are put back."""
-        self._each(lambda scene: scene.take(trial.object_id, trial.hold), slice(0, len(self._scenes)))
+        group = self._group_of(trial.object_id)
+        scenes = slice(0, len(self._scenes[group]))
+        self._each(group, lambda scene: scene.take(trial.object_id, trial.hold), scenes)
         self._taken.append(trial)
-        self._trials.clear()
+        self._trials = {k: known for k, known in self._trials.items() if self._group_of(k[0]) != group}
         self._grasps.clear()
 
-    def _draw(self, number: int) -> _DrawnScene:
-        scene = _DrawnScene(self.graph, self.ids, number, self._config, self._seed)
+    def _group_of(self, object_id: str) -> int:
+        return int(self._groups[self.ids.index(object_id)])
+
+    def _near(self, group: int) -> list[str]:
+        """Ids of a group, removed objects too."""
+        return [self.ids[k] for k in np.flatnonzero(self._groups == group)]
+
+    def _draw(self, group: int, number: int) -> _DrawnScene:
+        near = self._near(group)
+        bodies = {i: self._bodies[number][i] for i in near}
+        scene = _DrawnScene(self.graph.support_surface, bodies, self._config.lift)
         for trial in self._taken:
-            scene.take(trial.object_id, trial.hold)
+            if trial.object_id in near:
+                scene.take(trial.object_id, trial.hold)
         return scene
 
-    def _each(self, do: Callable[[_DrawnScene], Any], numbers: slice) -> list[Any]:
-        """Do something in these scenes, in order; those that are missing are drawn."""
-        missing = range(len(self._scenes), min(numbers.stop, self._config.rehearsal.draws))
+    def _each(self, group: int, do: Callable[[_DrawnScene], Any], numbers: slice) -> list[Any]:
+        """Do something in these scenes of a group, in order; those that are missing are drawn."""
+        drawn = self._scenes[group]
+        for number in range(len(self._bodies), min(numbers.stop, self._config.rehearsal.draws)):
+            rng = np.random.default_rng([self._seed, number])
+            self._bodies.append(_drawn_bodies(self.graph, number, self._config, rng))
+        missing = range(len(drawn), min(numbers.stop, self._config.rehearsal.draws))
         with ThreadPoolExecutor(self._threads) as pool:
-            self._scenes += pool.map(self._draw, missing)
-            return list(pool.map(do, self._scenes[numbers]))
+            drawn += pool.map(partial(self._draw, group), missing)
+            return list(pool.map(do, drawn[numbers]))
+
+
+def _groups(shapes: Sequence[Shape], gap: float) -> NDArray[np.int32]:
+    """Group (N,) of each of N shapes: those whose bounds, seen from above, are nearer than a gap [m].
+
+    A lift that moves no object by more than half the gap has no effect on another group.
+    """
+    low, high = (side[:, :2] for side in Primitives.of(shapes).bounds())
+    near = ((low[:, None] <= high + gap) & (low <= high[:, None] + gap)).all(axis=-1)
+    return np.asarray(connected_components(near, directed=False)[1])
 
 
 class _DrawnScene:
-    """The extracted shapes at rest or, for a number above 0, others as likely; and what is left of them."""
+    """The table and a group of bodies at rest, and what is left of them."""
 
-    def __init__(
-        self, graph: SupportGraph, ids: Sequence[str], number: int, config: Config, seed: int
-    ) -> None:
-        self._ids, self._config = ids, config.lift
-        spec = _drawn_spec(graph, number, config, np.random.default_rng([seed, number]))
-        self._lifting, self.unstable, self._state = _settled(spec, ids, config.lift)
+    def __init__(self, table: SceneObject | None, bodies: Mapping[str, Body], config: LiftConfig) -> None:
+        self._ids, self._config = list(bodies), config
+        spec = empty_spec("rehearsal")
+        # Twice MuJoCo's default time step, which the implicit integrator allows, for half the time.
+        spec.option.timestep = 0.004
+        # Else contacts creep by up to 3 mm/s, and what was seen at rest falls within seconds.
+        spec.option.noslip_iterations = 5
+        if table is not None:
+            _add_table(spec, table)
+        for name, body in bodies.items():
+            add_body(spec, name, body)
+        self._lifting, self.unstable, self._state = _settled(spec, self._ids, config)
 
     def lift(self, object_id: str, hold: Collection[str]) -> Lift:
         """Lift an object while others are held, and those that do not stay in place."""
@@ -351,8 +397,10 @@ class _DrawnScene:
         self._state[index, :3] = 0.0, 0.0, ASIDE + index
 
 
-def _drawn_spec(graph: SupportGraph, number: int, config: Config, rng: np.random.Generator) -> Any:
-    """A `mujoco.MjSpec` of the extracted shapes or, for a number above 0, of others as likely."""
+def _drawn_bodies(
+    graph: SupportGraph, number: int, config: Config, rng: np.random.Generator
+) -> dict[str, Body]:
+    """Bodies of the extracted shapes or, for a number above 0, of others as likely."""
     objects = list(graph.objects)
     if number > 0:
         objects = [drawn(o, rng, config.plausibility) for o in objects]
@@ -362,17 +410,8 @@ def _drawn_spec(graph: SupportGraph, number: int, config: Config, rng: np.random
     densities = rng.uniform(*settings.density, len(objects))
     if number == 0:
         frictions[:], densities[:] = np.mean(settings.friction), np.mean(settings.density)
-    spec = empty_spec("rehearsal")
-    # Twice MuJoCo's default time step, which the implicit integrator allows, for half the time.
-    spec.option.timestep = 0.004
-    # Else contacts creep by up to 3 mm/s, and what was seen at rest falls within seconds.
-    spec.option.noslip_iterations = 5
-    for o, friction, density in zip(objects, frictions, densities, strict=True):
-        if o.role == "support_surface":
-            _add_table(spec, o)
-        else:
-            add_body(spec, o.id, Body(o.shape, density, friction))
-    return spec
+    made = zip(objects, densities, frictions, strict=True)
+    return {o.id: Body(o.shape, density, friction) for o, density, friction in made}
 
 
 def _add_table(spec: Any, table: SceneObject) -> None:

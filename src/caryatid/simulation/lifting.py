@@ -159,7 +159,7 @@ class Lifting:
         start = np.empty(mujoco.mj_stateSize(model, _STATE))
         mujoco.mj_getState(model, data, start, _STATE)
         with mujoco_warnings_ignored(), Rollout(nthread=0) as rollout:
-            states, _ = rollout.rollout(model, mujoco.MjData(model), start[None], path, control_spec=_GRASPS)
+            states, _ = rollout.rollout(model, data, start[None], path, control_spec=_GRASPS)
         mujoco.mj_setState(model, data, states[0, -1], _STATE)
         data.mocap_pos[self._hand[index], 2] = path[0, -1, height]
         return np.array(data.qpos[self._qpos])
