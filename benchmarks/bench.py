@@ -46,6 +46,7 @@ MEASUREMENTS: dict[str, Callable[[Effort], list[Row]]] = {
     "real": speed.measure_real,
     "start": speed.measure_start,
     **{f"growth.{axis}": partial(speed.measure_growth, axis) for axis in speed.AXES},
+    "large": speed.measure_large,
     "viewer": measure_viewer,
 }
 """Name → what is measured; `turn` gives the rows of perceiving and of the stages too."""

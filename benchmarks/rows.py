@@ -29,19 +29,23 @@ Limit = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How many runs; sizes of fits [points], images [px], tables [objects], voxels [m]; views; recordings."""
+    """How many runs; sizes of fits [points], images [px], tables [objects], voxels [m]; views; recordings.
+
+    `crowd` is the number of objects on a large table.
+    """
 
     runs: int = 7
     points: tuple[int, ...] = (1000, 5000, 20_000)
     widths: tuple[int, ...] = (320, 452, 640, 904, 1280)
     objects: tuple[int, ...] = (5, 10, 20, 40, 70, 100)
     voxels: tuple[float, ...] = (0.04, 0.02, 0.01, 0.005)
-    views: int = 200
+    views: int = 500
+    crowd: int = 300
     real: Path = Path(__file__).parents[2] / "shared/data/real"
 
 
 FULL = Effort()
-QUICK = Effort(2, (5000,), (320, 640), (5, 10, 20), (0.02, 0.01), 30)
+QUICK = Effort(2, (5000,), (320, 640), (5, 10, 20), (0.02, 0.01), 30, 40)
 
 
 @dataclass(frozen=True, slots=True)

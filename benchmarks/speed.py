@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numba
 import numpy as np
+import psutil
 from peers import hash_voxels, open3d_chain, told
 from rows import PAUSE, Effort, Limit, Row, T, in_turns, median, timed, timed_row
 
@@ -27,6 +28,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import UP, Array
 from caryatid.io.bop import read_recording
+from caryatid.manipulation.order import plan_order
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.expected_visibility import SURFACE_SAMPLES
 from caryatid.planning.planners import make_planner
@@ -113,17 +115,18 @@ def _ring(scene: SimulatedScene, robot: Robot, config: Config, count: int) -> Ar
     return poses
 
 
-def table_of(count: int) -> SimulatedScene:
-    """A table with so many boxes, cylinders and balls in rows, every third one on top of another."""
+def table_of(count: int, size: tuple[float, float] = (1.2, 1.2), pitch: float = PITCH) -> SimulatedScene:
+    """A table [m] with so many boxes, cylinders and balls in rows, every third one on top of another."""
     rng = np.random.default_rng([count, 0])
     stacked = count // 3
-    side = int(np.ceil(np.sqrt(count - stacked)))
-    places = (np.argwhere(np.ones((side, side))) - (side - 1) / 2.0) * PITCH
+    rows = int(np.ceil(np.sqrt((count - stacked) * size[0] / size[1])))
+    columns = int(np.ceil((count - stacked) / rows))
+    places = (np.argwhere(np.ones((rows, columns))) - (np.array([rows, columns]) - 1) / 2.0) * pitch
     places = places[np.argsort(np.hypot(*places.T), kind="stable")][: count - stacked]
     below = [_standing(xy, 0.0, rng, flat=k < stacked) for k, xy in enumerate(places)]
     above = [_standing(b.T_world_object[:2, 3], b.extents[2], rng) for b in below[:stacked]]
     name = f"table-of-{count}"
-    return scene_from_spec(build_spec([Body(s) for s in (*below, *above)], name, (1.2, 1.2)), name, name)
+    return scene_from_spec(build_spec([Body(s) for s in (*below, *above)], name, size), name, name)
 
 
 def _standing(xy: Array, height: float, rng: np.random.Generator, *, flat: bool = False) -> Shape:
@@ -419,13 +422,14 @@ def _exponent(axis: str, segmentation: str, sizes: Sequence[float], turns: Seque
 
 def _over_views(segmentation: SegmentationMethod, views: int) -> list[Row]:
     """Rows of growth with the views seen, from the tenth on, and of peak memory, in a process of its own."""
-    turns, peak = _alone(_many_views, segmentation, views)
+    (turns, held), peak = _alone(_many_views, segmentation, views)
     edges = np.unique(np.geomspace(min(10, len(turns) // 2), len(turns) + 1, 13).astype(int))
     bins = [range(a, b) for a, b in pairwise(edges)]
     sizes = [float(np.exp(np.mean(np.log(b)))) for b in bins]
     row = _exponent("views", segmentation, sizes, [median([turns[v - 1] for v in b])[0] for b in bins])
     what = f"peak memory of {views} views, {SEGMENTS[segmentation]}"
-    return [row, Row(f"growth.memory.{segmentation}", what, peak, "MB", target=1024.0)]
+    note = f"{held[-1] - held[len(held) // 5]:.0f} MB in the last four fifths of them"
+    return [row, Row(f"growth.memory.{segmentation}", what, peak, "MB", target=1024.0, note=note)]
 
 
 def _alone(call: Callable[..., T], *arguments: object) -> tuple[T, float]:
@@ -437,14 +441,53 @@ def _alone(call: Callable[..., T], *arguments: object) -> tuple[T, float]:
     return result, int(status.split("VmHWM:")[1].split()[0]) / 1024.0
 
 
-def _many_views(segmentation: SegmentationMethod, views: int) -> list[float]:
-    """Whole turn of each of many views [s]."""
+def _many_views(segmentation: SegmentationMethod, views: int) -> tuple[list[float], list[float]]:
+    """Whole turn of each of many views [s], and the memory held after it [MB]."""
     scene = load_scene(HEAP)
-    episode, turns = Episode(record(scene, 1), segmentation), []
+    episode, process = Episode(record(scene, 1), segmentation), psutil.Process()
+    turns: list[float] = []
+    held: list[float] = []
     simulation = make_simulation(scene, Config(), noise="carmine", seed=0)
     for T_world_camera in _ring(scene, simulation.robot, Config(), views):
         turns.append(episode.look(T_world_camera, simulation.camera.capture(T_world_camera))["turn"])
-    return turns
+        held.append(process.memory_info().rss / 1e6)
+    return turns, held
+
+
+def measure_large(effort: Effort) -> list[Row]:
+    """Rows of a table of 3 × 2 m with very many objects: a turn, peak memory, and a removal order."""
+    rows = []
+    for name in SEGMENTATIONS:
+        (turns, ordering, found), peak = _alone(_many_objects, name, effort.crowd)
+        what = f"{effort.crowd} objects on 3 × 2 m, {SEGMENTS[name]}"
+        note = f"{found} found after {len(turns)} views, each of a part of the table"
+        rows += [
+            timed_row(f"large.turn.{name}", f"{what}: a turn", turns[1:], target=1000.0, note=note),
+            Row(f"large.memory.{name}", f"{what}: peak memory", peak, "MB", target=1500.0),
+        ]
+        if ordering:
+            rows.append(Row("large.order", f"{what}: a removal order", ordering, "s", target=60.0))
+    return rows
+
+
+def _many_objects(segmentation: SegmentationMethod, count: int) -> tuple[list[float], float, int]:
+    """Whole turns [s], time of a removal order with labels [s], and the number of objects found."""
+    size, middle = (3.0, 2.0), np.array([0.0, 0.0, TABLE_HEIGHT])
+    config = replace(Config(), voxels=replace(Config().voxels, extent=(3.2, 2.2, 0.5)))
+    simulation = make_simulation(table_of(count, size, 0.17), config, noise="carmine", seed=0)
+    scene, turns = Scene(config, segmentation=segmentation), []
+    for azimuth in GOLDEN_ANGLE * np.arange(8):
+        out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        pose = transforms.look_at(middle + (1.9, 1.4, 0.0) * out + (0.0, 0.0, 1.3), middle + 0.5 * out)
+        view, started = simulation.camera.capture(pose), time.perf_counter()
+        scene.update(fresh(view, labels=segmentation == "labels"))
+        next_best_view(scene, simulation.robot)
+        turns.append(time.perf_counter() - started)
+    started = time.perf_counter()
+    if segmentation == "labels":
+        plan_order(scene.graph, config, threads=numba.get_num_threads())
+    ordering = time.perf_counter() - started if segmentation == "labels" else 0.0
+    return turns, ordering, len(scene.graph.objects) - 1
 
 
 def measure_real(effort: Effort) -> list[Row]:

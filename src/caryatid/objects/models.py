@@ -54,6 +54,7 @@ class ObjectPoints:
         self._labels = np.zeros(0, dtype=np.int32)
         self._views = np.zeros(0, dtype=np.intp)
         self._selected: dict[tuple[int, float], Cloud] = {}
+        self._rows_of: dict[int, NDArray[np.intp]] | None = None
 
     def copy(self) -> ObjectPoints:
         """Return points that go on growing by themselves; the points so far are shared."""
@@ -89,27 +90,36 @@ class ObjectPoints:
                 cloud = self.of(label)
                 self._selected[label, edge] = cloud.select(thin(cloud.points_world, edge))
             else:
-                self._selected[label, edge] = self._select(np.flatnonzero(self._labels == label))
+                self._selected[label, edge] = self._select(self._rows(label))
         return self._selected[label, edge]
 
     def newest(self, label: int) -> Cloud:
         """Points of an object in the newest view that showed it."""
-        rows = np.flatnonzero(self._labels == label)
+        rows = self._rows(label)
         return self._select(rows[self._views[rows] == self._views[rows[-1]]])
 
     def everything(self) -> Cloud:
         """All points of all objects and of the support surface, with labels."""
         return self._select(np.argsort(self._labels, kind="stable"))
 
-    def bound(self, label: int, voxel: float, depth: int) -> None:
-        """Leave an object the newest points in each voxel [m] where more than twice `depth` views show it."""
+    def bound(self, voxels: Mapping[int, float], depth: int) -> None:
+        """Leave objects the newest points in each voxel where more than twice `depth` views show them.
+
+        Args:
+            voxels: Objects and the edge lengths of their voxels [m].
+            depth: Number of points left in a voxel [1].
+        """
         if self._views.max(initial=0) < 2 * depth:
             return
-        rows = np.flatnonzero(self._labels == label)
-        if np.count_nonzero(np.bincount(self._views[rows])) > 2 * depth:
-            kept = self._labels != label
-            kept[rows[last_in_voxels(self._cloud.points_world[rows], voxel, depth)]] = True
-            self._reorder(np.flatnonzero(kept), self._labels, {label})
+        kept, changed = np.ones(len(self._labels), dtype=np.bool_), set()
+        for label, edge in voxels.items():
+            rows = self._rows(label)
+            if np.count_nonzero(np.bincount(self._views[rows])) > 2 * depth:
+                kept[rows] = False
+                kept[rows[last_in_voxels(self._cloud.points_world[rows], edge, depth)]] = True
+                changed.add(label)
+        if changed:
+            self._reorder(np.flatnonzero(kept), self._labels, changed)
 
     def forget(self, labels: set[int]) -> None:
         """Drop the points of some objects."""
@@ -161,6 +171,15 @@ class ObjectPoints:
         self.labels_used = max(self.labels_used, *names)
         return names
 
+    def _rows(self, label: int) -> NDArray[np.intp]:
+        """Rows of the points of an object, ascending."""
+        if self._rows_of is None:
+            order = np.argsort(self._labels, kind="stable")
+            labels, starts = np.unique(self._labels[order], return_index=True)
+            parts = np.split(order, starts[1:]) if len(labels) else []
+            self._rows_of = dict(zip(labels.tolist(), parts, strict=True))
+        return self._rows_of.get(label, np.zeros(0, dtype=np.intp))
+
     def _select(self, rows: NDArray[np.intp]) -> Cloud:
         return replace(self._cloud.select(rows), labels=self._labels[rows])
 
@@ -171,7 +190,7 @@ class ObjectPoints:
 
     def _relabel(self, labels: NDArray[np.int32], changed: set[int]) -> None:
         """Set all points' labels (N,), and forget what was selected of some."""
-        self._labels = labels
+        self._labels, self._rows_of = labels, None
         self._selected = {key: held for key, held in self._selected.items() if key[0] not in changed}
 
 
@@ -327,8 +346,7 @@ class ObjectModels:
         voxels[SUPPORT_LABEL:] = config.surface.spacing
         kept = most_central(observation.cloud.points_world, observation.labels, voxels)
         self.points.add(observation.cloud.select(kept), observation.labels[kept], view)
-        for label in shown:
-            self.points.bound(label, voxels[label], config.cloud.depth)
+        self.points.bound({label: float(voxels[label]) for label in shown}, config.cloud.depth)
         return shown - {SUPPORT_LABEL}
 
     def move(self, T: Mapping[int, Array]) -> set[int]:
