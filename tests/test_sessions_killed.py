@@ -42,9 +42,7 @@ def test_however_a_service_is_killed_no_view_is_lost(tmp_path, around):
 
 def test_many_clients_at_once_lose_nothing(tmp_path, around):
     options = ("--open-sessions", 1)
-    orders, *_ = durability.put_load(
-        tmp_path, around * 2, clients=4, sessions=2, hostile=2, options=options
-    )
+    orders, *_ = durability.put_load(tmp_path, around * 2, clients=4, sessions=2, hostile=2, options=options)
     assert sorted(n for order in orders.values() for n in order) == list(range(16))
     assert all(len(order) == 8 for order in orders.values())
 

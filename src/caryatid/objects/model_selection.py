@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from itertools import combinations
 
 import numpy as np
 import scipy.sparse
@@ -321,24 +320,24 @@ def best_merge(
     Returns:
         The larger object and the one merged into it, or None if no merge pays.
     """
-    trees = {k: cKDTree(evidence.points) for k, (evidence, _) in known.items()}
-    sizes = {k: len(evidence) for k, (evidence, _) in known.items()}
-    sides = {k: _length_and_colour(evidence, config.explanation) for k, (evidence, _) in known.items()}
-
-    def gap(a: int, b: int) -> float:
-        """Maximum gap between parts of one object [m]: the longer one's length if they share a colour."""
-        (length, colour), (other_length, other) = sides[a], sides[b]
-        alike = colour is not None and other is not None and np.linalg.norm(colour - other) <= PLAIN
-        return max(config.explanation.reach, length, other_length) if alike else config.explanation.reach
-
-    pairs = [
-        (a, b)
-        for a, b in combinations(sorted(known), 2)
-        if {a, b} & changed
-        and frozenset((a, b)) not in distinct
-        and sizes[a] + sizes[b] >= GROWTH * apart.get((a, b), 0)
-        and trees[a].count_neighbors(trees[b], gap(a, b)) > 0
-    ]
+    labels, evidence = sorted(known), [known[k][0] for k in sorted(known)]
+    gaps = _gaps(evidence, config.explanation)
+    low, high = (np.array([f(e.points, axis=0) for e in evidence]).reshape(-1, 3) for f in (np.min, np.max))
+    between = np.maximum(np.maximum(low[:, None] - high, low - high[:, None]), 0.0)
+    near = np.triu(np.linalg.norm(between, axis=-1) <= gaps, 1)
+    trees: dict[int, cKDTree] = {}
+    pairs = []
+    for first, second in np.argwhere(near).tolist():
+        a, b = labels[first], labels[second]
+        grown = len(evidence[first]) + len(evidence[second]) >= GROWTH * apart.get((a, b), 0)
+        if not grown or not {a, b} & changed or frozenset((a, b)) in distinct:
+            continue
+        for k in (first, second):
+            if k not in trees:
+                trees[k] = cKDTree(evidence[k].points)
+        if trees[first].count_neighbors(trees[second], gaps[first, second]) > 0:
+            pairs.append((a, b))
+    sizes = {k: len(known[k][0]) for k in labels}
     best, most = None, 0.0
     gains = on_threads(lambda number: _gain(known, pairs[number], config, seed), len(pairs))
     for (a, b), gain in zip(pairs, gains, strict=True):
@@ -349,10 +348,17 @@ def best_merge(
     return best
 
 
-def _length_and_colour(evidence: Evidence, costs: ExplanationConfig) -> tuple[float, Array | None]:
-    """Length of an object [m], and its plain colour (3,): sides of that colour so far off may be its own."""
-    colour = None if evidence.rgb is None else plain_colour(evidence.rgb, costs)[1]
-    return float(np.linalg.norm(np.ptp(evidence.points, axis=0))), colour
+def _gaps(evidence: Sequence[Evidence], costs: ExplanationConfig) -> Array:
+    """Maximum gap (N, N) [m] between parts of one object: the longer one's length if they share a colour.
+
+    Sides of a plain colour so far off may be its own.
+    """
+    length = np.array([np.linalg.norm(np.ptp(e.points, axis=0)) for e in evidence])
+    found = [None if e.rgb is None else plain_colour(e.rgb, costs)[1] for e in evidence]
+    colour = np.array([np.full(3, np.nan) if c is None else c for c in found]).reshape(-1, 3)
+    alike = np.linalg.norm(colour[:, None] - colour, axis=-1) <= PLAIN
+    longer = np.maximum(np.maximum(length[:, None], length), costs.reach)
+    return np.where(alike, longer, costs.reach)
 
 
 def _gain(

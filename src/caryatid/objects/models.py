@@ -17,7 +17,7 @@ from caryatid.config import Config, SegmentationConfig
 from caryatid.fitting.primitives import Fit, FitFailure, fit
 from caryatid.geometry import points as kernels
 from caryatid.geometry.points import last_in_voxels, most_central
-from caryatid.geometry.shapes import Shape
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import UP, Array
 from caryatid.graph import SceneObject, object_id
 from caryatid.objects.compounds import Compound
@@ -649,25 +649,37 @@ def _nearest_objects(
     Args:
         points: (N, 3) [m].
         known: Points (M, 3) [m] of all objects.
-        owners: Object (M,) of each: 0 … K−1.
+        owners: Object (M,) of each: 0 … K−1, ascending.
         shapes: Shape of each object, or None.
         other_colour: Points that have another colour than the object (N, K).
         reach: Objects from here on count as none [m].
     """
     nearest, gap = np.full(len(points), -1, dtype=np.int32), np.full(len(points), reach)
-
-    def take(rows: NDArray[np.intp], distance: Array, number: int) -> None:
+    if not len(points):
+        return nearest
+    ends = np.searchsorted(owners, np.arange(len(shapes) + 1))
+    seen = np.flatnonzero(np.diff(ends))
+    shaped = [number for number, shape in enumerate(shapes) if shape is not None]
+    # Bounds of each object's points, and of its shape, two rows an object.
+    low, high = np.full((len(shapes), 2, 3), np.inf), np.full((len(shapes), 2, 3), -np.inf)
+    if len(seen):
+        low[seen, 0] = np.minimum.reduceat(known, ends[seen]) - reach
+        high[seen, 0] = np.maximum.reduceat(known, ends[seen]) + reach
+    corners = Primitives.of([s for s in shapes if s is not None]).bounds()
+    low[shaped, 1], high[shaped, 1] = corners[0] - reach, corners[1] + reach
+    may_be_near = ((low <= points.max(axis=0)) & (high >= points.min(axis=0))).all(axis=2)
+    for number, by in np.argwhere(may_be_near).tolist():
+        within = ((points > low[number, by]) & (points < high[number, by])).all(axis=1)
+        rows = np.flatnonzero(within & ~other_colour[:, number])
+        if not len(rows):
+            continue
+        shape = shapes[number]
+        if by == 0:
+            tree = cKDTree(known[ends[number] : ends[number + 1]], compact_nodes=False, balanced_tree=False)
+            distance = tree.query(points[rows], distance_upper_bound=reach)[0]
+        else:
+            assert shape is not None
+            distance = np.abs(shape.signed_distance(points[rows]))
         nearer = distance < gap[rows]
         nearest[rows[nearer]], gap[rows[nearer]] = number, distance[nearer]
-
-    for number, shape in enumerate(shapes):
-        own = known[owners == number]
-        rows = np.flatnonzero(~other_colour[:, number])
-        if len(own) and len(rows):
-            among = (points[rows] > own.min(axis=0) - reach) & (points[rows] < own.max(axis=0) + reach)
-            close = rows[among.all(axis=1)]
-            tree = cKDTree(own, compact_nodes=False, balanced_tree=False)
-            take(close, tree.query(points[close], distance_upper_bound=reach)[0], number)
-        if shape is not None and len(rows):
-            take(rows, np.abs(shape.signed_distance(points[rows])), number)
     return nearest
