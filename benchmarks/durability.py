@@ -24,8 +24,8 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import asdict, replace
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -58,7 +58,7 @@ from robot_client import RobotClient
 
 SENSOR = SensorConfig(width=160, height=120, focal=131.25)
 """Small images: a view takes a tenth of a second, so that much happens in little time."""
-SMALL = [f"--set=sensor.{name}={value}" for name, value in asdict(SENSOR).items() if value is not None]
+SMALL = [f"--set=sensor.{name}={getattr(SENSOR, name)}" for name in ("width", "height", "focal")]
 
 FORKS = multiprocessing.get_context("forkserver")  # processes that have imported everything, begun nothing
 FORKS.set_forkserver_preload(["caryatid.sessions.session", "caryatid.cli.sessions", "caryatid.service"])
@@ -358,7 +358,8 @@ def kill_benchmark(folder: Path, _: Sequence[View], kills: int, seed: int) -> Co
         else:
             time.sleep(chance.uniform(0.5, 6.0))
             tally["killed" if process.poll() is None else "ended before"] += 1
-            os.killpg(process.pid, signal.SIGKILL)
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
             process.wait()
         if (out / RESULTS).exists():
             with ResultStore(out / RESULTS) as store:

@@ -81,7 +81,7 @@ def test_a_session_over_http_is_the_session(client, views):
     answers = [client.post("/sessions/a/views", json=body(view)) for view in views[:2]]
     for number, answer in enumerate(answers):
         assert answer.status_code == 201
-        told = {"view": number, "changed": True, "note": None, "graph": graph_of(views[: number + 1])}
+        told = {"view": number, "changed": True, "warnings": [], "graph": graph_of(views[: number + 1])}
         assert told.items() <= answer.json().items()
         assert np.allclose(answer.json()["T_world_camera"], views[number].pose, atol=0.02)
 
@@ -126,9 +126,9 @@ def test_a_session_over_http_is_the_session(client, views):
 def test_a_view_without_a_table_is_kept_and_the_client_told(client, views):
     wall = body(wall_of(views[0]), number=0)
     first, again = (client.post("/sessions/a/views", json=wall) for _ in range(2))
-    assert first.json()["note"].endswith("this view is kept until a later one shows the table top")
+    assert first.json()["warnings"][0].endswith("this view is kept until a later one shows the table top")
     assert again.json() == first.json()
-    assert client.post("/sessions/a/views", json=body(views[0])).json()["note"] is None
+    assert client.post("/sessions/a/views", json=body(views[0])).json()["warnings"] == []
 
 
 def camera_of(view, **changes):

@@ -142,7 +142,7 @@ class ViewAnswer(Document):
     T_world_camera: list[list[float]] | None = Field(
         description="Pose [m] after registration, or null while the view waits"
     )
-    note: str | None = Field(description="Why the view is waiting, or null")
+    warnings: list[str] = Field(description="What may be wrong with the view, or why it waits")
     graph: dict[str, Any] = Field(description="graph.json")
 
 

@@ -185,8 +185,8 @@ class Solid(Shape):
     def signed_distance(self, points_world: Array) -> Array:
         """Distance (N,) [m] of points (N, 3) to the surface, negative inside.
 
-        Outside, where an edge or a corner is nearest, it is less: that to the farthest of the planes there, or
-        to the box around the solid if that is more.
+        Outside, where an edge or a corner is nearest, it is less: the distance to the farthest of the planes
+        there, or to the box around the solid if that is more.
         """
         points = transforms.transform(transforms.invert(self.T_world_object), points_world)
         faces = np.concatenate([p.faces for p in self.polytopes])

@@ -14,10 +14,12 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import logging
 import pickle
+import threading
 from base64 import b64encode
-from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from os import PathLike
@@ -135,20 +137,20 @@ class Added:
         graph: The fused support graph with it.
         changed: Whether it changed the graph.
         T_world_camera: Registered camera pose (4, 4), or None while the view waits.
-        note: Why the view waits for one that shows the table top, or None.
+        warnings: What may be wrong with the view, or why it waits; one sentence each.
     """
 
     number: int
     graph: SupportGraph
     changed: bool
     T_world_camera: Array | None = None
-    note: str | None = None
+    warnings: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer of `caryatid session add` and of the service."""
         pose = None if self.T_world_camera is None else self.T_world_camera.tolist()
         document = {"view": self.number, "changed": self.changed, "T_world_camera": pose}
-        return document | {"note": self.note, "graph": graph_to_json(self.graph)}
+        return document | {"warnings": list(self.warnings), "graph": graph_to_json(self.graph)}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -220,6 +222,8 @@ class Session:
         self._events = self._kept()
         self._first = self._decoded(0) if self._records else None
         self.scene = self._after(self._events)
+        waiting = self.scene.waiting
+        self._warnings: Sequence[str] = [KEPT % "no view shows a support surface yet"] if waiting else []
 
     @classmethod
     def begin(
@@ -344,13 +348,15 @@ class Session:
         decoded = self._decode(capture)
         self._check_alike(decoded)
         scene = self.scene.copy()
-        graph_text(scene.update(decoded))  # reject a view whose graph cannot be written
+        with _collected_warnings() as warnings:
+            graph_text(scene.update(decoded))  # reject a view whose graph cannot be written
         with StagedFolder(self._folder(self.views), durable=True) as folder:
             for name, content in capture.files().items():
                 folder.write(name, content)
             folder.publish()
         self._keep(record, scene)
         self._first = self._first or decoded
+        self._warnings = warnings
         return self._added()
 
     def take(self, object_id: str, T: ArrayLike | None = None) -> SupportGraph:
@@ -437,14 +443,13 @@ class Session:
             remove_file(self._report(len(left) - self.views))
         else:
             remove_folder(self._folder(self.views - 1))
-        self._events, self.scene = left, scene
+        self._events, self.scene, self._warnings = left, scene, []
         self._first = self._first if self._records else None
         return self.views
 
     def _added(self) -> Added:
-        note = KEPT % "no view shows a support surface yet" if self.scene.waiting else None
         pose = None if self.scene.waiting else self.scene.T_world_camera
-        return Added(self.views - 1, self.graph, self.scene.changed, pose, note)
+        return Added(self.views - 1, self.graph, self.scene.changed, pose, tuple(self._warnings))
 
     def _check_writable(self) -> None:
         if self._lock is None:
@@ -572,3 +577,18 @@ class _Unpickler(pickle.Unpickler):
             if known or isinstance(found, type):
                 return found
         raise pickle.UnpicklingError(f"{module}.{name} is not part of a scene")
+
+
+@contextmanager
+def _collected_warnings() -> Iterator[list[str]]:
+    """Collect the package's warnings that this thread logs."""
+    texts: list[str] = []
+    handler, thread = logging.Handler(logging.WARNING), threading.get_ident()
+    handler.addFilter(lambda record: record.thread == thread)
+    handler.emit = lambda record: texts.append(record.getMessage())  # type: ignore[method-assign]
+    log = logging.getLogger("caryatid")
+    log.addHandler(handler)
+    try:
+        yield texts
+    finally:
+        log.removeHandler(handler)
