@@ -2,9 +2,11 @@
 
     python benchmarks/accuracy.py suite [NAMES…] [--gate | --update]
     python benchmarks/accuracy.py extract RECORDINGS… --segmentation labels
+    python benchmarks/accuracy.py exact SCENES…
 
 `suite` measures the settings the committed baseline is of, all where no NAMES are given. RECORDINGS are BOP
-folders with masks and gt.json. `caryatid benchmark` compares planners and settings with confidence intervals.
+folders with masks and gt.json. `exact` infers supports from the true shapes. `caryatid benchmark` compares
+planners and settings with confidence intervals.
 """
 
 from __future__ import annotations
@@ -23,16 +25,23 @@ from measures import Gated, Measure, Spread, print_table, run_main
 from rich.console import Console
 
 from caryatid.benchmark.episodes import Episode, family, figures_of, run_episode
+from caryatid.benchmark.suites import SUITES as BENCHMARK
 from caryatid.config import Config, SegmentationMethod
 from caryatid.config.settings import read_settings
 from caryatid.errors import CaryatidError
-from caryatid.evaluation.scores import score_masks
+from caryatid.evaluation.scores import score, score_masks
+from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box
+from caryatid.graph import SceneObject
 from caryatid.io import write_recording
 from caryatid.io.bop import read_recording
 from caryatid.scene import Scene
+from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.scenes import is_builtin, load_scene
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import GroundTruth, TrueEdge, ground_truth, read_truth, write_truth
+from caryatid.support.relations import infer
 
 BASELINE = Path(__file__).with_name("accuracy_baseline.json")
 LEAST_READINGS = 200
@@ -152,6 +161,19 @@ def extract(episode: Episode) -> list[Row]:
     return rows
 
 
+def infer_exactly(name: str) -> list[Row]:
+    """Row of the supports between the true shapes of a built-in scene, on a table wider than it."""
+    started, truth = time.perf_counter(), true_scene_from_simulation(load_scene(name))
+    table = Box(transforms.rigid(np.eye(3), (0.0, 0.0, truth.table_top - 0.02)), np.array([3.0, 3.0, 0.04]))
+    objects = [SceneObject(truth.table or "table", SUPPORT_LABEL, table, "support_surface")]
+    objects += [SceneObject(o, k, shape) for k, (o, shape) in enumerate(truth.objects.items(), 1)]
+    graph = infer(objects, Config().support)
+    found = figures_of(score(graph, truth), graph, len(truth.objects))
+    return [
+        {"scene": name, "seed": 0, "view": 1, "perception_seconds": time.perf_counter() - started} | found
+    ]
+
+
 def record_frame(scene: str, folder: Path, config: Config, seed: int) -> None:
     """Record the robot's first view of a built-in scene: one noisy frame without a pose, and gt.json."""
     simulated = load_scene(scene)
@@ -265,9 +287,24 @@ class Extract(Spread):
         return 0
 
 
+@dataclass(frozen=True)
+class Exact(Spread):
+    """Infer supports from the true shapes: the rest is the limit of what shapes tell of forces."""
+
+    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = BENCHMARK["heaps"].scenes
+    """Built-in scenes. [default: the suite heaps of `caryatid benchmark`]"""
+
+    def run(self, console: Console) -> int:
+        """Infer and print."""
+        rows = [row for part in self.each(infer_exactly, self.scenes) for row in part]
+        show_rows(rows, console, "exact")
+        self.write(rows)
+        return 0
+
+
 def main() -> int:
     """Run the measurement."""
-    commands: dict[str, Any] = {"suite": SuiteRun, "extract": Extract}
+    commands: dict[str, Any] = {"suite": SuiteRun, "extract": Extract, "exact": Exact}
     return tyro.extras.subcommand_cli_from_dict(commands).run(Console(width=200))
 
 

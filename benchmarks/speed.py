@@ -438,7 +438,7 @@ def _alone(call: Callable[..., T], *arguments: object) -> tuple[T, float]:
         result = pool.submit(call, *arguments).result()
         # Unlike getrusage's, this peak is not that of the process that started this one.
         status = pool.submit(Path("/proc/self/status").read_text, "ascii").result()
-    return result, int(status.split("VmHWM:")[1].split()[0]) / 1024.0
+    return result, _peak(status)
 
 
 def _many_views(segmentation: SegmentationMethod, views: int) -> tuple[list[float], list[float]]:
@@ -458,7 +458,7 @@ def measure_large(effort: Effort) -> list[Row]:
     """Rows of a table of 3 × 2 m with very many objects: a turn, peak memory, and a removal order."""
     rows = []
     for name in SEGMENTATIONS:
-        (turns, ordering, found), peak = _alone(_many_objects, name, effort.crowd)
+        turns, peak, ordering, found = _alone(_many_objects, name, effort.crowd)[0]
         what = f"{effort.crowd} objects on 3 × 2 m, {SEGMENTS[name]}"
         note = f"{found} found after {len(turns)} views, each of a part of the table"
         rows += [
@@ -470,8 +470,8 @@ def measure_large(effort: Effort) -> list[Row]:
     return rows
 
 
-def _many_objects(segmentation: SegmentationMethod, count: int) -> tuple[list[float], float, int]:
-    """Whole turns [s], time of a removal order with labels [s], and the number of objects found."""
+def _many_objects(segmentation: SegmentationMethod, count: int) -> tuple[list[float], float, float, int]:
+    """Whole turns [s], peak memory [MB], a removal order with labels [s], and the number of objects found."""
     size, middle = (3.0, 2.0), np.array([0.0, 0.0, TABLE_HEIGHT])
     config = replace(Config(), voxels=replace(Config().voxels, extent=(3.2, 2.2, 0.5)))
     simulation = make_simulation(table_of(count, size, 0.17), config, noise="carmine", seed=0)
@@ -483,11 +483,16 @@ def _many_objects(segmentation: SegmentationMethod, count: int) -> tuple[list[fl
         scene.update(fresh(view, labels=segmentation == "labels"))
         next_best_view(scene, simulation.robot)
         turns.append(time.perf_counter() - started)
-    started = time.perf_counter()
+    peak, started = _peak(Path("/proc/self/status").read_text("ascii")), time.perf_counter()
     if segmentation == "labels":
         plan_order(scene.graph, config, threads=numba.get_num_threads())
     ordering = time.perf_counter() - started if segmentation == "labels" else 0.0
-    return turns, ordering, len(scene.graph.objects) - 1
+    return turns, peak, ordering, len(scene.graph.objects) - 1
+
+
+def _peak(status: str) -> float:
+    """Peak memory [MB] of a process by its status file."""
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024.0
 
 
 def measure_real(effort: Effort) -> list[Row]:
