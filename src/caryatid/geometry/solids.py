@@ -186,15 +186,14 @@ class Solid(Shape):
         """Distance (N,) [m] of points (N, 3) to the surface, negative inside.
 
         Outside, where an edge or a corner is nearest, it is less: the distance to the farthest of the planes
-        there, or to the box around the solid if that is more.
+        there, those of the box around the solid included.
         """
         points = transforms.transform(transforms.invert(self.T_world_object), points_world)
         faces = np.concatenate([p.faces for p in self.polytopes])
         ends = np.cumsum([len(p.faces) for p in self.polytopes])
         distances: Array = _distances(np.ascontiguousarray(points), faces, ends)
         # A thin edge has no plane that faces a point far beyond it.
-        beyond = np.linalg.norm(np.maximum(np.abs(points) - self.extents / 2.0, 0.0), axis=1)
-        return np.where(beyond > 0.0, np.maximum(distances, beyond), distances)
+        return np.maximum(distances, (np.abs(points) - self.extents / 2.0).max(axis=1))
 
     def outline(self) -> Array:
         """Corners (N, 3) [m] of all parts."""
