@@ -71,6 +71,16 @@ def counterweight():
 
 
 class TestOrder:
+    def test_only_objects_that_stand_together_are_rehearsed_together(self):
+        """The limit is on each group: the tower has three objects, and the box beside it is apart."""
+        for most, allowed in ((3, True), (2, False)):
+            config = replace(CONFIG, rehearsal=replace(CONFIG.rehearsal, max_objects=most))
+            if allowed:
+                assert plan_order(tower(), config, seed=3) == plan_order(tower(), CONFIG, seed=3)
+            else:
+                with pytest.raises(InputError, match="3 objects close together"):
+                    plan_order(tower(), config)
+
     def test_a_tower_is_taken_from_the_top(self):
         order = plan_order(tower(), CONFIG, seed=3)
         assert order.safe
