@@ -41,7 +41,7 @@ from caryatid.manipulation.dismantling import SimulatedHands, Taken
 from caryatid.manipulation.grasps import gripper_boxes
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.setup import make_simulation
-from caryatid.simulation.world import SimulatedScene, poses_of, quaternion, strayed
+from caryatid.simulation.world import SimulatedScene, poses_of, quaternion
 
 
 @dataclass(frozen=True)
@@ -56,16 +56,12 @@ class Args(OnScenes):
     """Objects to reach in each scene, one by one; 0 = take everything."""
     segmentation: SegmentationMethod = "labels"
     """Where segments come from."""
-    still: bool = False
-    """Lift in physics without creep, which else moves some piles by up to 3 mm/s with nothing lifted."""
 
 
 def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
     """Clear one scene, or reach each goal in it: a row for each."""
     name, args = task
     scene, _ = open_scene(name)
-    if args.still:
-        scene.spec.option.noslip_iterations = 5
     chosen = args.drawn(name, list(scene.object_bodies), args.goals) if args.goals else [None]
     rows = [cleared(name, scene, args, label) for label in chosen]
     print(*rows, sep="\n", file=sys.stderr, flush=True)
@@ -78,7 +74,7 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
     simulation = make_simulation(scene, config, noise=args.noise, seed=args.seed)
     known: dict[str, Any] = {"segmentation": args.segmentation, "seed": args.seed, "config": config}
     explorer = Explorer(simulation.camera, simulation.robot, **known)
-    hands, done, alone = SimulatedHands(scene, config), list[Taken](), list[bool]()
+    hands, done = SimulatedHands(scene, config), list[Taken]()
     grasps = list[tuple[list[str], bool]]()
 
     def take(step: TakeStep) -> bool:
@@ -86,8 +82,6 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
         if step.grasp is not None and body in hands.left:
             grasps.append(grasped(scene, before, step.grasp, body, config.gripper))
         done.append(hands.take(step, hands.bodies(explorer.scene.graph)))
-        if not done[-1].ok:
-            alone.append(moves_alone(scene, before, done[-1], config))
         simulation.camera.scene = hands.scene
         return done[-1].body is not None
 
@@ -96,7 +90,7 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
     lifted = [t for t in done if t.body is not None]
     harm = [f"{t.step.object_id}: {', '.join(t.disturbed)}" for t in lifted if not t.ok]
     row = {"scene": name, "objects": len(scene.object_bodies), "lifts": len(lifted), "views": len(steps)}
-    row |= {"missed": len(done) - len(lifted), "harmed": len(harm), "alone": sum(alone), "harm": harm}
+    row |= {"missed": len(done) - len(lifted), "harmed": len(harm), "harm": harm}
     row |= {"stop": steps[-1].stop, "grasps": len(grasps), "clear": sum(not t for t, _ in grasps)}
     row |= {"held": sum(held for _, held in grasps), "touched": [t for t, _ in grasps if t]}
     if goal is None:
@@ -104,14 +98,6 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
     body = scene.object_bodies[goal]
     row |= {"goal": f"o{goal}", "cleared": float(any(t.body == body for t in lifted))}
     return row | {"fewest": fewest(scene, body, config) if row["cleared"] else 0}
-
-
-def moves_alone(scene: SimulatedScene, before: Array, taken: Taken, config: Config) -> bool:
-    """Whether all that a lift disturbed moves as far in the same time with nothing lifted."""
-    names = list(scene.object_bodies.values())
-    after = Lifting(scene.spec, names).rest(before, (), 0.25 * len(taken.film))
-    moved = strayed(before, after, config.lift.moved, config.lift.turned)
-    return {n for n, m in zip(names, moved, strict=True) if m} >= set(taken.disturbed)
 
 
 def grasped(
@@ -212,7 +198,7 @@ def summary(rows: pd.DataFrame) -> dict[str, float]:
     found = {"runs": len(rows), "unharmed": unharmed.mean(), "cleared": rows["cleared"].mean()}
     found |= {"both": (unharmed & (rows["cleared"] == 1.0)).mean()}
     found |= {"lifts unharmed": 1.0 - rows["harmed"].sum() / rows["lifts"].sum()}
-    found |= {"harmful lifts": rows["harmed"].sum(), "of these, harm without a lift": rows["alone"].sum()}
+    found |= {"harmful lifts": rows["harmed"].sum()}
     found |= {"views per lift": rows["views"].sum() / rows["lifts"].sum(), "missed": rows["missed"].sum()}
     if rows["grasps"].sum():
         found |= {f"grasps {name}": rows[name].sum() / rows["grasps"].sum() for name in ("clear", "held")}

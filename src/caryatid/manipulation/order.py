@@ -375,8 +375,6 @@ class _DrawnScene:
         spec = empty_spec("rehearsal")
         # Twice MuJoCo's default time step, which the implicit integrator allows, for half the time.
         spec.option.timestep = 0.004
-        # Else contacts creep by up to 3 mm/s, and what was seen at rest falls within seconds.
-        spec.option.noslip_iterations = 5
         if table is not None:
             _add_table(spec, table)
         for name, body in bodies.items():
