@@ -519,10 +519,10 @@ class Scene(Pictured):
         if self.config.fusion.method != "sg":
             rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
             points = observation.cloud.points_world[rows]
-            new = appeared(view.name, points, observation.labels[rows], voxels.free_around(points))
+            new = appeared(view.name, points, observation.labels[rows], voxels.states_around(points))
         if named:
-            known = {object_id(k): why for k, why in new.items() if k in self._models.points.objects}
-            missing = known | missing
+            moved = {object_id(k): why for k, why in new.items() if k in self._models.points.objects}
+            missing = moved | missing
         for id_ in missing:
             o = next((o for o in self.graph.objects if o.id == id_), None)
             self._detector.lose(id_, o)

@@ -13,6 +13,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Change, ChangeKind, SceneObject
 from caryatid.sensing.views import View
+from caryatid.sensing.voxel_map import FREE, OCCUPIED
 
 DEPTH_MARGIN = 0.02
 """Distance behind a point at which a reading contradicts it [m], at 1.5 m and growing with z²: 2σ of pose
@@ -123,25 +124,28 @@ class ChangeDetector:
 
 
 def appeared(
-    name: str, points_world: Array, labels: NDArray[np.int32], free: NDArray[np.bool_]
+    name: str, points_world: Array, labels: NDArray[np.int32], states: NDArray[np.int8]
 ) -> dict[int, str]:
     """Find segments that lie where earlier views saw free space.
+
+    Points in unknown space do not count: an object there may be new, or seen for the first time.
 
     Args:
         name: Name of the view.
         points_world: Points (N, 3) [m] of its segments.
         labels: Segment (N,) of each.
-        free: Whether space was free around each (N,).
+        states: States (N, M) of the voxels around each, from earlier views.
 
     Returns:
         Labels of these segments, each with the reason.
     """
+    free, occupied = (states == FREE).all(axis=1), (states == OCCUPIED).any(axis=1)
     new = dict[int, str]()
     for label in np.unique(labels).tolist():
         own = labels == label
-        there, other = distinct(points_world[own & free]), distinct(points_world[own & ~free])
+        there, other = distinct(points_world[own & free]), distinct(points_world[own & occupied])
         if likelihood_ratio(there, other) > PRIOR_ODDS:
-            new[label] = f"{name} shows {there} of {there + other} of its points where space was free"
+            new[label] = f"{name} shows {there} of its points where space was free, {other} where not"
     return new
 
 

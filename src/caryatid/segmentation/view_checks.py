@@ -101,7 +101,8 @@ def check_free(
     points = points_world[:: max(1, len(points_world) // 20_000)]
     over = (points - surface.point_world) @ surface.normal_world > 2.0 * config.surface.tolerance
     over &= ((points > voxels.origin_world) & (points < voxels.end_world)).all(axis=1)
-    free = voxels.free_around(points[over]) if aligned else voxels.state_at(points[over]) == FREE
+    states = voxels.states_around(points[over]) == FREE
+    free = states.all(axis=1) if aligned else states[:, 0]
     if free.sum() > (THROUGH if aligned else UNALIGNED) * len(free):
         log.warning(
             "%s: %.0f%% of its points above the table are in space that earlier views saw as free; its pose "

@@ -28,8 +28,8 @@ from caryatid.sensing.views import View
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 """States of a voxel."""
-NEIGHBOURS = np.concatenate([np.eye(3), -np.eye(3)])
-"""A voxel and those that share a face with it."""
+AROUND = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+"""Steps (7, 3) to a voxel itself and to those that share a face with it [1]."""
 FULLY = float(np.cos(np.deg2rad(60.0)))
 """Cosine of the angle to its normal up to which a point is shown fully [1]."""
 
@@ -190,14 +190,10 @@ class VoxelMap:
         """State (N,) of the voxels that hold points (N, 3) [m]; 0 outside the map."""
         return _values_at(self.states, points_world, self.origin_world, self.config.size)
 
-    def free_around(self, points_world: Array) -> NDArray[np.bool_]:
-        """Whether the voxels (N,) that hold points (N, 3) [m], and those beside them, were seen free."""
-        free = self.state_at(points_world) == FREE
-        rows = np.flatnonzero(free)
-        around = points_world[rows, None] + NEIGHBOURS * self.config.size
-        states = self.state_at(around.reshape(-1, 3)).reshape(-1, len(NEIGHBOURS))
-        free[rows] = (states == FREE).all(axis=1)
-        return free
+    def states_around(self, points_world: Array) -> NDArray[np.int8]:
+        """States (N, 7) of the voxels that hold points (N, 3) [m], and of those beside, by a face."""
+        around = points_world[:, None] + AROUND * self.config.size
+        return self.state_at(around.reshape(-1, 3)).reshape(-1, len(AROUND))
 
     def empty_at(self, points_world: Array) -> NDArray[np.bool_]:
         """Whether the voxels (N,) that hold points (N, 3) [m] were looked through and never hit.
