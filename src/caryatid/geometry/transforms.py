@@ -14,9 +14,7 @@ Array = NDArray[np.float64]
 UP: Array = np.array([0.0, 0.0, 1.0])
 """The world's vertical (3,)."""
 FARTHEST = 1e6
-"""Largest coordinate of a translation [m]: beyond it, float64 does not resolve a nanometre, and units are
-wrong.
-"""
+"""Largest coordinate of a translation [m]; beyond it, units are wrong, and float64 resolves no nanometre."""
 RIGID_TOLERANCE = 1e-4
 """How far RᵀR may be from the identity (per entry, no unit) before a matrix is refused as a rotation."""
 
@@ -46,11 +44,8 @@ def as_rigid(T: ArrayLike, name: str = "transform") -> Array:
         raise InputError(name, f"more than {FARTHEST:g} m from the world's origin", "give it in metres")
     R = matrix[:3, :3]
     if not np.allclose(R.T @ R, np.eye(3), atol=RIGID_TOLERANCE) or np.linalg.det(R) < 0.0:
-        raise InputError(
-            name,
-            "the 3×3 part is not a rotation (not orthonormal, or mirrored)",
-            "check units and row order; p_world = T_world_camera @ p_camera",
-        )
+        reason = "the 3×3 part is not a rotation (not orthonormal, or mirrored)"
+        raise InputError(name, reason, "check units and row order; p_world = T_world_camera @ p_camera")
     return matrix
 
 

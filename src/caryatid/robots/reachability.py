@@ -82,9 +82,8 @@ def sample_reachability(
     config = config or ArmConfig()
     bounds = np.asarray(limits, dtype=np.float64)
     if bounds.ndim != 2 or bounds.shape[1] != 2 or len(bounds) == 0 or not np.isfinite(bounds).all():
-        raise InputError(
-            "limits", f"expected finite numbers (J, 2), not shape {bounds.shape}", "give (low, high)"
-        )
+        reason = f"expected finite numbers (J, 2), not shape {bounds.shape}"
+        raise InputError("limits", reason, "give (low, high)")
     crossed = np.flatnonzero(bounds[:, 0] > bounds[:, 1])
     if len(crossed):
         raise InputError("limits", f"joint {crossed[0]} has low > high", "give the lower limit first")

@@ -40,11 +40,8 @@ def labels_from_masks(
     if scores is not None:
         quality = np.asarray(scores, dtype=np.float64)
         if quality.shape != (len(stack),) or not np.isfinite(quality).all():
-            raise InputError(
-                "scores",
-                f"have shape {quality.shape} or hold NaN for {len(stack)} masks",
-                "give one finite score per mask, or no scores",
-            )
+            reason = f"have shape {quality.shape} or hold NaN for {len(stack)} masks"
+            raise InputError("scores", reason, "give one finite score per mask, or no scores")
     pixels = stack.sum(axis=(1, 2))
     kept = (pixels >= config.min_pixels) & (pixels <= config.max_share * stack[0].size)
     kept &= quality >= config.min_score

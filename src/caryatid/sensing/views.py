@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -55,56 +55,48 @@ class View(Pictured):
     ignored: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
-        depth = _numbers(self.depth, np.float32, f"{self.name}: depth")
+        name, assign = self.name, partial(object.__setattr__, self)
+        depth = _numbers(self.depth, np.float32, f"{name}: depth")
         if depth.ndim != 2 or depth.size == 0:
-            raise InputError(
-                self.name, f"depth has shape {depth.shape}", "give a depth image (H, W) in metres"
-            )
+            raise InputError(name, f"depth has shape {depth.shape}", "give a depth image (H, W) in metres")
         depth = np.where(np.isnan(depth), np.float32(0.0), depth)
         if np.isinf(depth).any() or (depth < 0.0).any():
             bad = "infinite" if np.isinf(depth).any() else "negative"
-            raise InputError(self.name, f"depth contains {bad} values", "mark missing readings with 0 or NaN")
+            raise InputError(name, f"depth contains {bad} values", "mark missing readings with 0 or NaN")
         # Anything nearer than a micrometre is not a reading, and its inverse may be infinite.
         depth = np.where(depth < 1e-6, np.float32(0.0), depth)
-        object.__setattr__(self, "depth", depth)
-        object.__setattr__(self, "K", check_intrinsics(self.K, self.name))
+        assign("depth", depth)
+        assign("K", check_intrinsics(self.K, name))
         if self.T_world_camera is not None:
-            T = transforms.as_rigid(self.T_world_camera, f"{self.name}: T_world_camera")
-            object.__setattr__(self, "T_world_camera", T)
+            assign("T_world_camera", transforms.as_rigid(self.T_world_camera, f"{name}: T_world_camera"))
         if self.labels_are not in ("objects", "segments"):
-            raise InputError(self.name, f"labels_are is '{self.labels_are}'", "choose objects or segments")
+            raise InputError(name, f"labels_are is '{self.labels_are}'", "choose objects or segments")
         if self.labels is not None and np.ndim(self.labels) == 3:
-            object.__setattr__(self, "labels", labels_from_masks(self.labels))
-            object.__setattr__(self, "labels_are", "segments")
+            assign("labels", labels_from_masks(self.labels))
+            assign("labels_are", "segments")
         kinds = {"rgb": np.uint8, "labels": np.int32, "normals_camera": np.float32, "ignored": np.bool_}
         for field, dtype in kinds.items():
             image = getattr(self, field)
             if image is None:
                 continue
-            image = _numbers(image, None, f"{self.name}: {field}")
+            image = _numbers(image, None, f"{name}: {field}")
             if image.shape[:2] != depth.shape:
-                raise InputError(
-                    self.name,
-                    f"{field} is {_size(image)}, depth is {_size(depth)}",
-                    "register the images to one size",
-                )
+                reason = f"{field} is {_size(image)}, depth is {_size(depth)}"
+                raise InputError(name, reason, "register the images to one size")
             if field == "rgb" and (image.dtype != np.uint8 or image.shape[2:] != (3,)):
                 reason = f"rgb has shape {image.shape} and type {image.dtype}"
-                raise InputError(
-                    self.name, reason, "give (H, W, 3) uint8, such as (255 * rgb).astype(np.uint8)"
-                )
-            if field == "labels" and (image.dtype.kind == "f" and (image != np.rint(image)).any()):
+                raise InputError(name, reason, "give (H, W, 3) uint8, such as (255 * rgb).astype(np.uint8)")
+            if field == "labels" and image.dtype.kind == "f" and (image != np.rint(image)).any():
                 remedy = "give integers (H, W), or a stack of masks (N, H, W)"
-                raise InputError(self.name, "labels are not integers", remedy)
+                raise InputError(name, "labels are not integers", remedy)
             if field == "labels" and ((image < 0).any() or (image >= SUPPORT_LABEL).any()):
-                raise InputError(
-                    self.name, f"labels exceed 0…{SUPPORT_LABEL - 1}", "number objects from 1, 0 = no object"
-                )
-            object.__setattr__(self, field, image.astype(dtype, copy=False))
+                remedy = "number objects from 1, 0 = no object"
+                raise InputError(name, f"labels exceed 0…{SUPPORT_LABEL - 1}", remedy)
+            assign(field, image.astype(dtype, copy=False))
         if self.ignored is not None:
-            object.__setattr__(self, "depth", np.where(self.ignored, np.float32(0.0), depth))
+            assign("depth", np.where(self.ignored, np.float32(0.0), depth))
             if self.labels is not None:
-                object.__setattr__(self, "labels", np.where(self.ignored, np.int32(0), self.labels))
+                assign("labels", np.where(self.ignored, np.int32(0), self.labels))
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
@@ -185,10 +177,8 @@ class Cloud(Pictured):
                 continue
             array = _numbers(values, None, f"{self.name}: {field}")
             if array.shape != (len(self.points_world), *shape):
-                wanted = ", ".join(["N", *map(str, shape)])
-                raise InputError(
-                    self.name, f"{field} has shape {array.shape}", f"give ({wanted}), one for each point"
-                )
+                reason, wanted = f"{field} has shape {array.shape}", ", ".join(["N", *map(str, shape)])
+                raise InputError(self.name, reason, f"give ({wanted}), one for each point")
             object.__setattr__(self, field, array)
 
     def __len__(self) -> int:
@@ -267,28 +257,20 @@ def check_intrinsics(K: Array, name: str) -> Array:
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         raise InputError(name, "K is not a finite 3×3 matrix", "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     if matrix[0, 0] <= 0.0 or matrix[1, 1] <= 0.0:
-        raise InputError(
-            name,
-            f"K has focal lengths {matrix[0, 0]:g}, {matrix[1, 1]:g}",
-            "give positive focal lengths in pixels",
-        )
+        reason = f"K has focal lengths {matrix[0, 0]:g}, {matrix[1, 1]:g}"
+        raise InputError(name, reason, "give positive focal lengths in pixels")
     return matrix
 
 
 def _numbers(values: Any, dtype: DTypeLike | None, name: str) -> NDArray[Any]:
-    """The values as an array of numbers of a type; None = as they are.
-
-    Raises:
-        InputError: They are none.
-    """
+    """The values as an array of numbers of a type; None = as they are."""
     try:
         array = np.asarray(values, dtype=dtype)
     except (TypeError, ValueError):
         array = np.array(None)
     if array.dtype.kind not in "biuf":
-        raise InputError(
-            name, f"expected an array of numbers, not {type(values).__name__}", "give a NumPy array"
-        )
+        reason = f"expected an array of numbers, not {type(values).__name__}"
+        raise InputError(name, reason, "give a NumPy array")
     return array
 
 
