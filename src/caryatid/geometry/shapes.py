@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from caryatid.errors import InputError
 from caryatid.geometry import BOX, CYLINDER, SPHERE, transforms
+from caryatid.geometry.signed_distance import distances_and_gradients, sample_surface, signed_distances
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.display import Pictured
 
@@ -121,8 +122,6 @@ class Shape(Pictured):
 
     def signed_distance(self, points_world: Array) -> Array:
         """Distance (N,) [m] of points (N, 3) to the surface, negative inside."""
-        from caryatid.geometry.signed_distance import signed_distances
-
         points = np.ascontiguousarray(points_world, np.float64)
         distances: Array = signed_distances(*Primitives.of([self]).row(0), points)
         return distances
@@ -134,28 +133,18 @@ class Shape(Pictured):
 
     def surface(self, spacing: float) -> tuple[Array, Array]:
         """Points (N, 3) [m] about `spacing` metres apart all over the surface, and outward normals (N, 3)."""
-        from caryatid.geometry.signed_distance import sample_surface
-
         points, normals = sample_surface(*Primitives.of([self]).row(0), float(spacing))
         return points, normals
 
     def mesh(self, corners: int = 48) -> Any:
-        """The shape as a `trimesh.Trimesh` in the object's frame.
-
-        Args:
-            corners: Corners that stand for a circle [1].
-        """
+        """The shape as a `trimesh.Trimesh` in the object's frame; so many corners stand for a circle."""
         import trimesh
 
         T_object_world = transforms.invert(self.T_world_object)
         return trimesh.convex.convex_hull(transforms.transform(T_object_world, self.outline()))
 
     def to_trimesh(self, corners: int = 48) -> Any:
-        """The shape as a `trimesh.Trimesh` in the world frame [m].
-
-        Args:
-            corners: Corners that stand for a circle [1].
-        """
+        """The shape as a `trimesh.Trimesh` in the world frame [m]; so many corners stand for a circle."""
         return self.mesh(corners).apply_transform(self.T_world_object)
 
     def lines(self, eye_world: Array) -> list[Array]:
@@ -426,8 +415,6 @@ class Primitives(NamedTuple):
 
     def gradient(self, index: int, points_world: Array) -> tuple[Array, Array]:
         """Signed distances (M,) [m] of points (M, 3) to one shape, and their outward directions (M, 3)."""
-        from caryatid.geometry.signed_distance import distances_and_gradients
-
         points = np.ascontiguousarray(points_world, np.float64)
         distances, outward = distances_and_gradients(*self.row(index), points)
         return distances, outward @ self.R[index].T

@@ -7,17 +7,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from caryatid.config import Config, RobotConfig
 from caryatid.errors import InputError, PlanningError
+from caryatid.geometry.transforms import Array, rigid, rotation_from_vector
 from caryatid.planning.posture import Posture
+from caryatid.robots.arm import ArmRobot
+from caryatid.robots.floor import FloorGrid
+from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.robots.protocol import OwnViews, Robot, Unreachable, refusal_of, view_sphere_of, waypoints_of
-
-if TYPE_CHECKING:
-    from caryatid.config import Config, RobotConfig
-    from caryatid.geometry.transforms import Array
-    from caryatid.robots.floor import FloorGrid
-    from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.robots.reachability import read_reachability
+from caryatid.sensing.view_sphere import ViewSphere, direction
 
 __all__ = [
     "OwnViews", "Posture", "Robot", "RobotMaker", "Surroundings", "Unreachable", "find_robot", "home_view",
@@ -51,8 +53,6 @@ class Surroundings:
     @property
     def T_world_base(self) -> Array:
         """Pose (4, 4) of an arm's base by the settings."""
-        from caryatid.geometry.transforms import rigid, rotation_from_vector
-
         arm = self.config.arm
         turn = rotation_from_vector((0.0, 0.0, math.radians(arm.base_yaw)))
         return rigid(turn, self.centre_world + arm.base)
@@ -78,13 +78,8 @@ def find_robot(name: str) -> RobotMaker:
         InputError: There is no such robot, its file is broken, or its module cannot be imported.
     """
     if name == HUMANOID:
-        from caryatid.robots.humanoid import HumanoidRobot
-
         return lambda around: HumanoidRobot(around.floor, around.config.robot)
     if name.startswith(ARM):
-        from caryatid.robots.arm import ArmRobot
-        from caryatid.robots.reachability import read_reachability
-
         reachability = read_reachability(name.removeprefix(ARM))
         return lambda around: ArmRobot(
             reachability, around.T_world_base, around.config.arm, furniture=around.floor
@@ -113,10 +108,6 @@ def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:
     Raises:
         PlanningError: No view of the sphere can be reached.
     """
-    import numpy as np
-
-    from caryatid.sensing.view_sphere import direction
-
     candidates = robot.candidates(view_sphere_of(robot, sphere))
     rejected = dict(candidates.rejected)
     nearness = candidates.directions @ direction(*np.deg2rad(config.home))

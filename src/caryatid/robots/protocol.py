@@ -5,19 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from caryatid.errors import PlanningError
+from caryatid.geometry.transforms import Array
+from caryatid.planning.candidates import Candidates
 from caryatid.planning.posture import Posture
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from caryatid.geometry.transforms import Array
-    from caryatid.planning.candidates import Candidates
-    from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.sensing.view_sphere import ViewSphere
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +96,7 @@ class SimulatedRobot(Robot):
         return self._T_world_camera
 
     def _posture_at(self, T_world_camera: Array) -> Posture:
-        """The posture at a pose (4, 4).
-
-        Raises:
-            PlanningError: The pose cannot be reached.
-        """
+        """The posture at a pose (4, 4); a `PlanningError` if it cannot be reached."""
         posture = self.solve(T_world_camera)
         if isinstance(posture, Unreachable):
             raise PlanningError(f"the robot cannot reach this view: {posture.reason}")
