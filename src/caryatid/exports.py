@@ -48,12 +48,7 @@ def format_of(path: Path, wanted: ExportFormat | None = None) -> ExportFormat:
 
 
 def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | None = None) -> None:
-    """Write a scene model to a file, whole or not at all; a file already there is replaced.
-
-    Args:
-        graph: The scene model.
-        path: The file; its name says the format.
-        config: Density, friction and how fine meshes are.
+    """Write a scene model to a file, whose name says the format, whole or not at all; an old one is replaced.
 
     Raises:
         InputError: The suffix is unknown, there is nothing to export or too much, the format rejects the
@@ -180,10 +175,7 @@ def _numbers(*values: float) -> str:
 
 
 def _gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool) -> bytes:
-    """The node `z_up`, and under it a node per object, named by its id, in the report's colour.
-
-    Shape, size and role are in each mesh's extras.
-    """
+    """The node `z_up`, and under it a node per object, named by its id, in the report's colour."""
     import trimesh
     from trimesh.exchange.gltf import export_glb, export_gltf
     from trimesh.visual.material import PBRMaterial
@@ -226,11 +218,7 @@ def _graphml(graph: SupportGraph) -> str:
 
 
 def to_dot(graph: SupportGraph) -> str:
-    """Write the support graph as DOT, drawn as in the report: the table below, uncertain supports dashed.
-
-    Args:
-        graph: The graph.
-    """
+    """Write the support graph as DOT, drawn as in the report: the table below, uncertain supports dashed."""
     lines = ["digraph supports {", "  rankdir=BT;", '  node [style=filled, fontname="sans-serif"];']
     for item in graph.objects:
         colour = object_colour(item.label)

@@ -6,7 +6,6 @@ import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from types import NoneType
 
@@ -25,7 +24,7 @@ from caryatid.robots import HUMANOID, Robot, find_robot
 from caryatid.robots.recording import RecordingCamera, RecordingRobot
 from caryatid.scene import KEPT, LEFT_OUT
 from caryatid.segmentation.observation import level_transform
-from caryatid.sensing.views import Camera, View
+from caryatid.sensing.views import Camera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
 
@@ -162,9 +161,7 @@ def open_recording(
     if recording.is_video:
         recording = choose_frames(recording, config.recording)
     if ignore is not None:
-        frames = [
-            replace(f, load=partial(_seen, f, ignore, config.recording.max_pixels)) for f in recording.frames
-        ]
+        frames = [_ignoring(f, ignore, config.recording.max_pixels) for f in recording.frames]
         recording = replace(recording, frames=frames)
     if level:
         recording = levelled(recording, config)
@@ -196,15 +193,8 @@ def extract(
 ) -> Iterator[Step]:
     """Open a recording or a cloud, and return the steps of all its views.
 
-    Args:
-        source: Name, file or folder.
-        config: All settings.
-        segmentation: `labels`, `auto`, or None to use labels if available.
-        seed: Seed of every random choice.
-        label_divisor: For a cloud with labels of object parts: object = label // this.
-        masks: Source of masks, or None to use those of the views.
-        ignore: Mask of pixels to ignore in a recording, as for `without_ignored`, or None.
-        level: Rotate the world frame of a recording so that the table is level.
+    For a cloud with labels of object parts, object = label // `label_divisor`. The other arguments are as in
+    `open_source`, but the seed is that of every random choice.
 
     Raises:
         InputError: The source is unknown, broken, or lacks required labels; or masks are given for a cloud.
@@ -229,9 +219,9 @@ def extract(
     return (replace(step, labels=stored.spread(step.labels)) for step in steps)
 
 
-def _seen(frame: Frame, ignore: Path, max_pixels: int) -> View:
-    """The view of a frame, without the pixels to ignore."""
-    return without_ignored(frame.load(), ignore, max_pixels)
+def _ignoring(frame: Frame, ignore: Path, max_pixels: int) -> Frame:
+    """A frame whose view lacks the pixels to ignore."""
+    return replace(frame, load=lambda: without_ignored(frame.load(), ignore, max_pixels))
 
 
 def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:

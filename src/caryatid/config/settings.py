@@ -51,12 +51,7 @@ def preset(name: Preset) -> Config:
 
 
 def changed_settings(base: Config, document: Mapping[str, Any], source: str) -> Config:
-    """Return a configuration with some settings changed: stage → name → value.
-
-    Args:
-        base: Configuration to start from.
-        document: As read by `tomllib` or `json`.
-        source: Name of the document in errors.
+    """Return a configuration with some settings changed: stage → name → value; errors name the source.
 
     Raises:
         InputError: A name or value is not valid.

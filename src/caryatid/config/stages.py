@@ -59,8 +59,7 @@ class CloudConfig:
     min_depth: NotNegative = 0.1
     """Readings nearer than this are dropped [m]; the robot's hand, or below any sensor's range."""
     normal_window: Count = 7
-    """Maximum side of the square window in which planes are fitted for normals [px]; 7 × 7 reduces the noise
-    to a quarter."""
+    """Maximum side of the window in which normals are fitted [px]; 7 × 7 reduces the noise to a quarter."""
     normal_size: Positive = 0.02
     """Side of that window on the surface, at the median distance [m]: 7 px at 1.5 m with f = 525 px; fewer
     in coarse images, where 7 px would span an object."""
@@ -632,8 +631,7 @@ class RehearsalConfig:
     risk: Share = 0.02
     """Maximum probability that a safe lift moves another object [1]; with 0, no lift is safe."""
     max_objects: Count = 300
-    """Maximum number of objects within 4 cm of each other [1]; MuJoCo reserves 0.6 GB per thread for 300, and
-    4.7 GB for 1,000."""
+    """Maximum number of objects within 4 cm of each other [1]; 300 take 0.6 GB per thread, 1,000 4.7 GB."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

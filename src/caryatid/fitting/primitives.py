@@ -117,12 +117,7 @@ def candidates(
 ) -> list[Fit]:
     """Return the best fit of each shape that could be fitted, lowest cost first; none if points are few.
 
-    Args:
-        points: (N, 3) [m], in any frame.
-        normals: Unit normals (N, 3) towards the sensor.
-        config: Limits and thresholds.
-        rng: Source of the samples.
-        whole: Whether bare parts of sides that should have been seen whole cost.
+    The arguments are as in `fit`; `whole` says whether bare parts of sides that should have been seen cost.
     """
     fits, judged_by = _ranked(*_finite(points, normals), config, rng)
     return sorted((_with_bare(f, judged_by) for f in fits), key=lambda f: f.cost) if whole else fits

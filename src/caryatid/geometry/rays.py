@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from caryatid.runtime.parallel import inner, kernel
 
-Grid = NDArray[np.uint8]
-"""One byte per voxel, indexed [x, y, z]."""
 Triple = tuple[float, float, float]
 """One number per axis."""
 Voxel = tuple[int, int, int]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Shape
+from caryatid.geometry.shapes import Box, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import kernel
 
@@ -111,8 +111,7 @@ class Solid(Shape):
     @classmethod
     def from_extents(cls, T_world_object: Array, extents: Array) -> Solid:
         """Build a cuboid with a pose (4, 4) and edge lengths (3,) [m]."""
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
-        return cls.from_size(T_world_object, {"parts": [signs * extents / 2.0]})
+        return cls.from_size(T_world_object, {"parts": [Box(np.eye(4), extents).outline()]})
 
     @classmethod
     def from_size(cls, T_world_object: Array, size: Any) -> Solid:

@@ -13,21 +13,22 @@ if TYPE_CHECKING:
     from caryatid.io.importing import import_recording
     from caryatid.io.point_clouds import read_stored_cloud
 
-_HOMES = {
-    "bop": ["read_recording", "write_recording"],
-    "datasets": ["Dataset", "Frame", "OpenOptions", "open_dataset"],
-    "graph_json": ["graph_from_json", "graph_text", "graph_to_json", "read_graph"],
-    "importing": ["import_recording"],
-    "point_clouds": ["read_stored_cloud"],
-}
-
 __all__ = [
     "Dataset", "Frame", "OpenOptions", "graph_from_json", "graph_text", "graph_to_json", "import_recording",
     "open_dataset", "read_graph", "read_recording", "read_stored_cloud", "write_recording",
 ]  # fmt: skip
 
 if not TYPE_CHECKING:
-    __getattr__ = imported_late(__name__, _HOMES)
+    __getattr__ = imported_late(
+        __name__,
+        {
+            "bop": ["read_recording", "write_recording"],
+            "datasets": ["Dataset", "Frame", "OpenOptions", "open_dataset"],
+            "graph_json": ["graph_from_json", "graph_text", "graph_to_json", "read_graph"],
+            "importing": ["import_recording"],
+            "point_clouds": ["read_stored_cloud"],
+        },
+    )
 
 
 def __dir__() -> list[str]:

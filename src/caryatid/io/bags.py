@@ -23,9 +23,8 @@ from caryatid.sensing.views import check_intrinsics
 
 SUFFIXES: Final = (".bag", ".mcap", ".db3")
 """Suffixes of bags; a folder with a metadata.yaml is one too."""
-COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
 TYPES: Final[Mapping[str, tuple[str, ...]]] = {
-    "images": ("sensor_msgs/msg/Image", COMPRESSED),
+    "images": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
     "cameras": ("sensor_msgs/msg/CameraInfo",),
     "transforms": ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"),
 }
@@ -51,12 +50,7 @@ def recognises(path: Path) -> bool:
 
 
 def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> Dataset:
-    """Open a bag.
-
-    Args:
-        path: `.bag`, `.mcap`, `.db3`, or a folder with a metadata.yaml.
-        config: Limits of time and range.
-        options: The topics.
+    """Open a bag: a file `.bag`, `.mcap` or `.db3`, or a folder with a metadata.yaml.
 
     Raises:
         InputError: `rosbags` is not installed; the bag is damaged, empty, or lacks a topic or frame; or its

@@ -154,12 +154,7 @@ def format_of(path: Path) -> Any:
 def open_dataset(
     path: str | Path, config: RecordingConfig | None = None, options: OpenOptions | None = None
 ) -> Dataset:
-    """Open a dataset of any known format.
-
-    Args:
-        path: BOP scene folder, TUM RGB-D folder, bag, `sample-recording`, or a format of another package.
-        config: Limits of time and range.
-        options: Options of the format.
+    """Open a BOP scene folder, a TUM RGB-D folder, a bag, `sample-recording`, or a format of another package.
 
     Raises:
         InputError: It does not exist, has an unknown format, or is damaged.

@@ -141,11 +141,7 @@ def graph_text(graph: SupportGraph) -> str:
 
 
 def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportGraph:
-    """Read a graph from the document of graph.json; unknown keys are ignored.
-
-    Args:
-        document: The parsed JSON object.
-        source: The file, for errors.
+    """Read a graph from the document of graph.json; unknown keys are ignored, errors name the source.
 
     Raises:
         InputError: Another format or version, a missing key, an edge to an object that does not exist, a
@@ -180,9 +176,6 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
 
 def read_graph(path: str | Path) -> SupportGraph:
     """Read a graph.json.
-
-    Args:
-        path: The file.
 
     Raises:
         InputError: The file is missing, broken or not a graph; see `graph_from_json`.

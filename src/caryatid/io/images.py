@@ -30,15 +30,7 @@ class BrokenImageError(InputError):
 
 
 def read_depth(path: Path, depth_scale: float, max_pixels: int = MAX_PIXELS) -> NDArray[np.float32]:
-    """Read a 16-bit depth PNG.
-
-    Args:
-        path: The file.
-        depth_scale: One unit [mm].
-        max_pixels: As for `decode_image`.
-
-    Returns:
-        Depth (H, W) [m], 0 = no reading.
+    """Read the depth (H, W) [m], 0 = no reading, of a 16-bit PNG in units of `depth_scale` [mm].
 
     Raises:
         InputError: Missing, truncated, too large, or not 16 bit.

@@ -35,7 +35,6 @@ _REMEDIES: Final[Mapping[str, str]] = {
     DARK: "allow fewer with --set recording.min_readings=SHARE",
 }
 """Remedies if no frame is usable, by reason."""
-_UP: Final = np.array([0.0, 0.0, 1.0])
 
 
 def import_recording(
@@ -75,17 +74,13 @@ def import_recording(
 def levelled(dataset: Dataset, config: Config) -> Dataset:
     """Turn the world of a dataset so that the table is level; without poses, nothing changes.
 
-    Args:
-        dataset: The frames.
-        config: How to find a table.
-
     Raises:
         InputError: No table is found to level the world.
     """
     if not dataset.has_poses:
         return dataset
     T_level_world = _level_rotation(dataset, config)
-    turn = np.rad2deg(transforms.angle_between(T_level_world[2, :3], _UP))
+    turn = np.rad2deg(transforms.angle_between(T_level_world[2, :3], transforms.UP))
     note = f"world frame rotated by {turn:.1f}° to level the table"
     frames = [_turned(frame, T_level_world) for frame in dataset.frames]
     return replace(dataset, frames=frames, notes=(*dataset.notes, note))
@@ -96,10 +91,6 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
 
     Sharpness is the variance of the Laplacian of the brightness. Without colour it is the share of pixels
     with a reading, because a moving depth camera loses readings at edges.
-
-    Args:
-        dataset: The frames.
-        config: Which frames are sharp and which viewpoints different, and the maximum number of frames.
 
     Returns:
         The dataset with the chosen frames, ordered by time; the others count as skipped.
@@ -200,7 +191,7 @@ def _level_rotation(dataset: Dataset, config: Config) -> Array:
     if 2 * int(near.sum()) < len(ups):
         reason = f"only {int(near.sum())} of {len(ups)} views agree on which way is up"
         raise InputError(dataset.path, reason, "omit --level, and give poses in a level world frame")
-    turn, _ = Rotation.align_vectors(_UP[None], ups[near].mean(axis=0)[None])
+    turn, _ = Rotation.align_vectors(transforms.UP[None], ups[near].mean(axis=0)[None])
     return transforms.rigid(turn.as_matrix(), np.zeros(3))
 
 

@@ -28,12 +28,7 @@ ONNX: Final = "onnx:"
 
 
 def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
-    """Return the source of masks.
-
-    Args:
-        name: `onnx:FILE`, a model; or a folder of masks.
-        config: All stages' settings.
-        seed: Seed of the segments that a model may use as prompts.
+    """Return the source of masks: `onnx:FILE`, a model, or a folder. The seed is that of a model's prompts.
 
     Raises:
         InputError: There is no such file or folder, or the model does not return instance masks.

@@ -61,13 +61,7 @@ class StoredCloud:
         """Keep the readings and give them normals.
 
         Stored normals are used, scaled to length 1. If the file has none, or not for every reading, all are
-        estimated from neighbours and point to the viewpoint.
-
-        Args:
-            config: Neighbours a normal is estimated from.
-
-        Returns:
-            The readings in the file's frame, in the file's order.
+        estimated from neighbours and point to the viewpoint. Frame and order are those of the file.
         """
         kept = self.kept
         points = self.points[kept]

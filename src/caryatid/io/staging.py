@@ -141,12 +141,7 @@ class StagedFolder:
 
 
 def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
-    """Write one file, whole or not at all; an existing one is replaced.
-
-    Args:
-        path: The file.
-        content: Its bytes.
-        durable: Wait until it is on disk.
+    """Write one file, whole or not at all; an existing one is replaced. `durable` waits until it is on disk.
 
     Raises:
         InputError: It is a folder, or the disk cannot be written; nothing is left behind.
@@ -208,11 +203,7 @@ def recover(place: Path) -> None:
 
 @contextmanager
 def read_errors(path: Path, remedy: str) -> Iterator[None]:
-    """Turn an OSError while reading into one sentence with the path and the reason.
-
-    Args:
-        path: The file.
-        remedy: What the user can do about it.
+    """Turn an OSError while reading into one sentence with the path, the reason and this remedy.
 
     Raises:
         InputError: Instead of the OSError.

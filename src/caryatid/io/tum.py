@@ -47,12 +47,7 @@ def recognises(path: Path) -> bool:
 
 
 def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> Dataset:
-    """Open a TUM RGB-D folder.
-
-    Args:
-        path: The folder; its name may hold `freiburg1`, `freiburg2` or `freiburg3`.
-        config: Limits of time and range.
-        options: The camera.
+    """Open a TUM RGB-D folder; without a camera file, the name of the folder says which camera it is.
 
     Raises:
         InputError: A list is missing or broken, or the camera is unknown.

@@ -135,8 +135,9 @@ def _load(
         others = _described(camera.size or size, camera.frame)
         reason = f"its images ({others}) differ from the depth images ({shown})"
         raise InputError(camera.name, reason, "give the camera of the depth images")
-    rgb = None if colour is None else colour.decode()
-    if colour is not None and rgb is not None:
+    rgb = None
+    if colour is not None:
+        rgb = colour.decode()
         registered = _described(rgb.shape[1::-1], colour.frame)
         if registered != shown:
             reason = f"depth ({shown}) is not registered to colour ({registered})"

@@ -81,12 +81,7 @@ def compile_kernels() -> None:
 
 
 def warm_up(locks: str, number: int) -> None:
-    """Call all kernels, in a process of its own.
-
-    Args:
-        locks: Folder of the locks by which the processes take turns.
-        number: Number of the process, which decides where it starts.
-    """
+    """Call all kernels, starting at one by the process's number; several take turns by locks in a folder."""
     # A compiler makes many long-lived objects; looking for garbage among them takes a tenth of its time.
     gc.set_threshold(200_000, 50, 100)
     _take_turns(Path(locks))

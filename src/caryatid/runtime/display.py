@@ -10,12 +10,7 @@ hooks: dict[str, str] = {}
 
 
 def call(hook: str, *arguments: Any) -> Any:
-    """Call the function registered for a hook, and return its result.
-
-    Args:
-        hook: One of the names in `hooks`.
-        arguments: Arguments of the function.
-    """
+    """Call the function registered for one of the `hooks`, and return its result."""
     return resolve_name(hooks[hook])(*arguments)
 
 

@@ -22,9 +22,7 @@ from caryatid.sensing.surfels import MIN_COSINE, even_sample, surfels_of
 from caryatid.sensing.views import Cloud
 
 BUCKETS = 4096
-"""Lists in which a view's patches are kept, by a hash of label and cell [1]; more patches make longer
-lists.
-"""
+"""Lists in which a view's patches are kept, by a hash of label and cell [1]."""
 OUTLIER = 0.3
 """Share of the reach beyond which distances lose their weight [1]."""
 INDEPENDENT = 0.1
@@ -233,10 +231,7 @@ class ViewRegistration:
         return bool(turn > np.radians(self._config.max_rotation) or move > self._config.max_translation)
 
     def _refine(self) -> None:
-        """Move all kept views together that are not exact, unless they then fit worse.
-
-        Views that few partners link to the others stay in place.
-        """
+        """Move all kept views together that are not exact, unless they then fit worse."""
         before, edges_before = self._now, self._edges
         for _ in range(3):
             if not self._solve():
@@ -309,7 +304,7 @@ class ViewRegistration:
         numbers, moves, twists = list(views), {}, self.twists.copy()
         T, T_told = (twist_transform(t[numbers], self._pivot) for t in (self._now, self.twists))
         for v, now, told in zip(numbers, T, T_told, strict=True):
-            moved = views[v].sample[:, :3] @ (now - told)[:3, :3].T + (now - told)[:3, 3]
+            moved = transforms.transform(now - told, views[v].sample[:, :3])
             settled = (0.3 * self._config.noise) ** 2
             if v == numbers[-1] or np.einsum("ni,ni->n", moved, moved).max(initial=0.0) > settled:
                 moves[v] = now @ transforms.invert(told)

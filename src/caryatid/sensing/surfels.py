@@ -38,8 +38,7 @@ def surfels_of(
     Returns:
         Patches (P, 8), and the side (P,) each is of: one part of the view, facing roughly one way.
     """
-    if cloud.labels is None:
-        raise ValueError("surfels are made of labelled points")
+    assert cloud.labels is not None
     voxels, kinds, sums = _gathered(cloud.points_world, cloud.normals_world, cloud.labels, config)
     far = kinds // 6 == SUPPORT_LABEL
     count = sums[:, 0]
