@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-import numpy as np
-
 from caryatid.config import ExportConfig
 from caryatid.config.choices import ExportFormat
 from caryatid.errors import InputError
@@ -116,10 +114,10 @@ def _urdf(graph: SupportGraph, config: ExportConfig) -> str:
         diagonal = {name: _numbers(mass * m) for name, m in zip(("ixx", "iyy", "izz"), moments, strict=True)}
         SubElement(inertial, "inertia", diagonal | dict.fromkeys(("ixy", "ixz", "iyz"), "0"))
         for what in ("visual", "collision"):
-            for T_object_part, shape in _boxes(item.shape):
+            for shape in _boxes(item.shape):
                 element = SubElement(link, what)
                 if shape is not item.shape:
-                    SubElement(element, "origin", _pose(T_object_part))
+                    SubElement(element, "origin", _pose(shape.T_world_object))
                 geometry = SubElement(element, "geometry")
                 match shape:
                     case Cylinder(radius=radius, height=height):
@@ -139,18 +137,14 @@ def _urdf(graph: SupportGraph, config: ExportConfig) -> str:
     return tostring(robot, encoding="unicode", xml_declaration=True) + "\n"
 
 
-def _boxes(shape: Shape) -> Sequence[tuple[Array, Shape]]:
-    """A shape for URDF: itself, or the smallest box around each part, with poses (4, 4) in it."""
+def _boxes(shape: Shape) -> Sequence[Shape]:
+    """A shape for URDF: itself, or the smallest box around each part, in the shape's frame."""
     if not isinstance(shape, Solid):
-        return [(np.eye(4), shape)]
+        return [shape]
     import trimesh
 
-    boxes = []
-    for part in shape.polytopes:
-        T_box_object, extents = trimesh.bounds.oriented_bounds(part.vertices)
-        T_object_box = transforms.invert(T_box_object)
-        boxes.append((T_object_box, Box(T_object_box, extents)))
-    return boxes
+    bounds = (trimesh.bounds.oriented_bounds(part.vertices) for part in shape.polytopes)
+    return [Box(transforms.invert(T_box_object), extents) for T_box_object, extents in bounds]
 
 
 def _pose(T: Array) -> dict[str, str]:

@@ -28,8 +28,7 @@ def close_hidden_faces(
 
     The sides that points confirm are refined by least squares alone, with the others out of the way: neither
     the pull on the extents nor points beyond a rim shift them. Then each unseen side is put where the points
-    on
-    the faces beside it end: at the likeliest end of an even density blurred by the fit's own noise, which
+    on the faces beside it end: at the likeliest end of an even density blurred by the fit's own noise, which
     neither a trimmed share nor the spread of the noise biases. A side without such points stays.
 
     Args:
