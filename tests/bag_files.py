@@ -18,8 +18,7 @@ from caryatid.io.images import png
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
-STEP = SECOND // 30
-"""Time of the first frame, and between frames [ns]."""
+"""Time of the first frame [ns]."""
 
 DEPTH, INFO, RGB = "/camera/depth/image", "/camera/depth/camera_info", "/camera/rgb/image"
 WORLD, BASE, LENS = "map", "base", "optical"
@@ -81,10 +80,10 @@ class BagFile:
             data=rows.ravel(),
         )
 
-    def compressed(self, time, data, form, frame=LENS):
+    def compressed(self, time, data, form):
         data = np.frombuffer(data, dtype=np.uint8)
         kind = self.type("sensor_msgs/msg/CompressedImage")
-        return kind(header=self.header(time, frame), format=form, data=data)
+        return kind(header=self.header(time, LENS), format=form, data=data)
 
     def camera(self, time, K, size, frame=LENS, D=(0.0,) * 5):
         region = self.type("sensor_msgs/msg/RegionOfInterest")

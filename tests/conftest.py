@@ -216,10 +216,9 @@ def points(views):
     return views[0].points_camera[seen], views[0].labels[seen]
 
 
-def pcd_text(points, labels=None, count=None) -> str:
-    """An ascii PCD, `count` points promised in its header."""
-    table = points if labels is None else np.column_stack([points, labels])
-    count = len(points) if count is None else count
+def pcd_text(points, labels=None) -> str:
+    """An ascii PCD."""
+    table, count = points if labels is None else np.column_stack([points, labels]), len(points)
     label = "" if labels is None else " label"
     header = (
         f"VERSION .7\nFIELDS x y z{label}\nSIZE 4 4 4{' 4' if label else ''}\n"
@@ -233,8 +232,8 @@ def pcd_text(points, labels=None, count=None) -> str:
 def write_pcd(tmp_path):
     """Write an ascii PCD, and return its path."""
 
-    def write(*cloud, count=None):
-        (tmp_path / "cloud.pcd").write_text(pcd_text(*cloud, count=count))
+    def write(*cloud):
+        (tmp_path / "cloud.pcd").write_text(pcd_text(*cloud))
         return tmp_path / "cloud.pcd"
 
     return write

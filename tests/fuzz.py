@@ -59,22 +59,9 @@ NUMBERS = (
     1e300, -1e300, float("nan"), float("inf"), -float("inf"),
 )  # fmt: skip
 WORDS = (
-    "",
-    "\n",
-    "a\nb",
-    "table",
-    "world",
-    "o0",
-    "o1",
-    "\ud800",
-    "\0",
-    "..",
-    "../x",
-    "/",
-    "é",
-    "<b>&\"'",
+    "", "\n", "a\nb", "table", "world", "o0", "o1", "\ud800", "\0", "..", "../x", "/", "é", "<b>&\"'",
     "x" * 5000,
-)
+)  # fmt: skip
 VALUES = (None, True, False, [], {}, [[]], [1, "a"], {"a": 1})
 
 

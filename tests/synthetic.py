@@ -82,12 +82,6 @@ def motion_about_vertical(rng: np.random.Generator, reach: float = 1.0) -> Array
     return transforms.rigid(R, rng.uniform(-reach, reach, 3))
 
 
-def moved(cloud: Cloud, T: Array) -> Cloud:
-    points, normals = transforms.transform(T, cloud.points_world), transforms.rotate(T, cloud.normals_world)
-    eye = None if cloud.viewpoint_world is None else transforms.transform(T, cloud.viewpoint_world)
-    return replace(cloud, points_world=points, normals_world=normals, viewpoint_world=eye)
-
-
 def surface_points(
     shape: Shape, rng: np.random.Generator, *, eye=None, spacing: float = 0.005, sigma: float = 1e-6
 ) -> tuple[Array, Array]:

@@ -42,8 +42,8 @@ def candidates_of(points, normals, config=CONFIG, seed=0):
     return candidates(points, normals, config=config, rng=np.random.default_rng(seed))
 
 
-def noisy_normals(normals, rng, degrees=5.0):
-    return transforms.unit(normals + np.radians(degrees) * rng.normal(size=normals.shape))
+def noisy_normals(normals, rng):
+    return transforms.unit(normals + np.radians(5.0) * rng.normal(size=normals.shape))
 
 
 @each
@@ -269,9 +269,9 @@ def face_points(shape, axis, sign, count, rng, sigma):
     return transforms.transform(shape.T_world_object, local) + sigma * rng.normal(size=(count, 3))
 
 
-def two_faces(seed, sigma=0.002, shape=BOX):
+def two_faces(seed, shape=BOX):
     rng = np.random.default_rng(seed)
-    return np.concatenate([face_points(shape, a, 1.0, 1000, rng, sigma) for a in (1, 2)])
+    return np.concatenate([face_points(shape, a, 1.0, 1000, rng, 0.002) for a in (1, 2)])
 
 
 def mantle_points(shape, count, rng, sigma):

@@ -17,12 +17,12 @@ from caryatid.sensing.views import View
 K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
 
 
-def make_views(count=3):
-    rng = np.random.default_rng(count)
+def make_views():
+    rng = np.random.default_rng(3)
     labels = np.zeros((48, 64), dtype=np.int32)
     labels[10:20, 10:30], labels[20:30, 12:20] = 7, 300
     views = []
-    for _ in range(count):
+    for _ in range(3):
         depth = rng.uniform(0.4, 3.0, (48, 64)).astype(np.float32)
         depth[:5] = 0.0
         rgb = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)

@@ -60,13 +60,13 @@ def unfit(refused):
     return lambda source, *options, says: refused("import", source, *options, names="", says=says)
 
 
-def same_views(recording, views, atol=0.00051, colour=True):
+def same_views(recording, views, atol=0.00051):
     assert len(recording) == len(views)
     for view, original in zip(recording, views, strict=True):
         assert np.allclose(view.depth, original.depth, atol=atol)
         assert np.allclose(view.T_world_camera, original.T_world_camera, atol=1e-6)
         assert np.array_equal(view.K, original.K)
-        assert not colour or np.array_equal(view.rgb, original.rgb)
+        assert np.array_equal(view.rgb, original.rgb)
 
 
 # What is in a bag comes out

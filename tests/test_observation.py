@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import TABLE_TOP, motion_about_vertical, moved, simulated_cloud, simulated_views
+from synthetic import TABLE_TOP, motion_about_vertical, simulated_cloud, simulated_views
 
 from caryatid.config import Config
 from caryatid.errors import InputError, PerceptionError
@@ -175,7 +175,7 @@ def test_a_cloud_in_its_sensors_frame_is_levelled():
     observation = observation_of(VIEW, "labels")
     T_camera_world = transforms.invert(VIEW.pose)
     world = replace(observation.cloud, labels=VIEW.labels.ravel()[observation.pixels])
-    stored = moved(world, T_camera_world)
+    stored = world.moved(T_camera_world)
     level = stored.moved(level_transform(stored, CONFIG, np.random.default_rng(0), use_labels=True))
     above = world.points_world[:, 2] - TABLE_TOP
     np.testing.assert_allclose(level.points_world[:, 2], above, atol=0.003)

@@ -16,7 +16,6 @@ from synthetic import (
     hausdorff,
     model_of,
     motion_about_vertical,
-    moved,
     random_motion,
     simulated_cloud,
     simulated_views,
@@ -132,7 +131,7 @@ def test_the_graph_of_a_scene_does_not_turn_with_it(name):
     @given(seeds)
     def check(seed):
         T = motion_about_vertical(np.random.default_rng(seed))
-        there = model_of([moved(cloud, T)]).graph
+        there = model_of([cloud.moved(T)]).graph
         assert vertices(there) == vertices(here)
         assert edges(there) == edges(here)
         for o in here.objects[1:]:

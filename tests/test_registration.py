@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import TABLE_TOP, box, cylinder, direction, moved, sphere, surface_points
+from synthetic import TABLE_TOP, box, cylinder, direction, sphere, surface_points
 
 from caryatid.config import RegistrationConfig
 from caryatid.geometry import transforms
@@ -27,9 +27,9 @@ SCENE = (
 BOXES = SCENE[:2]
 
 
-def seen_from(azimuth_deg: float, shapes=SCENE, *, sigma=1e-3, seed=0, elevation_deg=38.0) -> Cloud:
+def seen_from(azimuth_deg: float, shapes=SCENE, *, sigma=1e-3, seed=0) -> Cloud:
     """What a camera 1.5 m away sees of shapes and table, each reading with its own noise."""
-    eye = PIVOT + 1.5 * direction(np.radians(azimuth_deg), np.radians(elevation_deg))
+    eye = PIVOT + 1.5 * direction(np.radians(azimuth_deg), np.radians(38.0))
     rng = np.random.default_rng(seed)
     points, normals, labels = [], [], []
     for label, shape in [*enumerate(shapes, start=1), (SUPPORT_LABEL, TABLE)]:
@@ -59,11 +59,6 @@ def drawn_error(rng, sigma_mm=10.0, sigma_deg=1.0) -> Array:
     return motion(sigma_mm * rng.normal(size=3), sigma_deg / np.sqrt(3.0) * rng.normal(size=3))
 
 
-def put_right(cloud: Cloud, error: Array) -> Cloud:
-    shifted = moved(cloud, error)
-    return replace(shifted, viewpoint_world=transforms.transform(error, cloud.viewpoint_world))
-
-
 def left(registration: ViewRegistration, view: int, error: Array) -> float:
     """How far a point 20 cm from the pivot is from where it belongs, at the worst [m]."""
     corners = PIVOT + 0.2 * np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1), (-1, 0, 0), (0, -1, 0)])
@@ -77,7 +72,7 @@ LARGE = motion(translation_mm=(30.0, -25.0, 20.0), rotation_deg=(1.5, -1.5, 2.0)
 @pytest.mark.parametrize("error", [*(drawn_error(np.random.default_rng(k)) for k in range(3)), LARGE])
 @pytest.mark.parametrize("same_labels", [True, False])
 def test_errors_of_centimetres_and_degrees_are_undone(error, same_labels):
-    views = [seen_from(180.0, seed=1), put_right(seen_from(120.0, seed=2), error)]
+    views = [seen_from(180.0, seed=1), seen_from(120.0, seed=2).moved(error)]
     result = registered(views, same_labels=same_labels)
     assert left(result, 0, error) > 0.005
     assert left(result, 1, error) < 0.002
@@ -89,7 +84,7 @@ def test_later_views_put_right_what_opposite_ones_do_not_show():
     errors = [np.eye(4), *(drawn_error(rng) for _ in range(3))]
     angles = (180.0, 0.0, 90.0, 270.0)
     views = [
-        put_right(seen_from(a, BOXES, seed=k), e) for k, (a, e) in enumerate(zip(angles, errors, strict=True))
+        seen_from(a, BOXES, seed=k).moved(e) for k, (a, e) in enumerate(zip(angles, errors, strict=True))
     ]
     alone, together = registered(views[:2]), registered(views)
     assert left(alone, 1, errors[1]) > 0.01
@@ -103,7 +98,7 @@ def test_earlier_views_are_reported_as_moved_and_the_first_never_is():
     earlier = set()
     for k, angle in enumerate((180.0, 0.0, 90.0, 270.0)):
         error = drawn_error(rng) if k else np.eye(4)
-        moves = registration.add(put_right(seen_from(angle, BOXES, seed=k), error), same_labels=True)
+        moves = registration.add(seen_from(angle, BOXES, seed=k).moved(error), same_labels=True)
         earlier |= {v for v in moves if v < k}
         for v, T in moves.items():
             so_far[v] = T @ so_far.get(v, np.eye(4))
@@ -116,7 +111,7 @@ def test_earlier_views_are_reported_as_moved_and_the_first_never_is():
 
 def test_a_table_alone_leaves_what_it_does_not_show_as_reported():
     error = motion(translation_mm=(4.0, -3.0, 6.0), rotation_deg=(0.3, 0.3, 0.4))
-    first, second = seen_from(180.0, (), seed=1), put_right(seen_from(0.0, (), seed=2), error)
+    first, second = seen_from(180.0, (), seed=1), seen_from(0.0, (), seed=2).moved(error)
     # Without a viewpoint an error of orientation turns about the pivot and moves nothing sideways.
     twist = registered([first, replace(second, viewpoint_world=None)]).twists[1]
     # Height and tilt are seen; sliding on the plane and turning about its normal are not.
@@ -127,7 +122,7 @@ def test_a_table_alone_leaves_what_it_does_not_show_as_reported():
 
 def test_another_label_is_never_the_same_surface():
     error = motion(translation_mm=(4.0, -3.0, 0.0))
-    first, second = seen_from(180.0, seed=1), put_right(seen_from(120.0, seed=2), error)
+    first, second = seen_from(180.0, seed=1), seen_from(120.0, seed=2).moved(error)
     renamed = np.where(second.labels == SUPPORT_LABEL, SUPPORT_LABEL, second.labels + 10)
     views = [first, replace(second, labels=renamed)]
     assert left(registered(views), 1, error) > 0.004
@@ -145,7 +140,7 @@ def test_what_lies_elsewhere_or_is_next_to_nothing_stays_as_reported():
     first, other = seen_from(180.0, seed=1), seen_from(120.0, seed=2)
     nothing = replace(other, labels=np.zeros_like(other.labels))
     line = other.points_world[0] + np.outer(np.linspace(0.0, 0.1, len(other)), (1.0, 0.0, 0.0))
-    elsewhere = put_right(other, motion(translation_mm=(0.0, 0.0, 900.0)))
+    elsewhere = other.moved(motion(translation_mm=(0.0, 0.0, 900.0)))
     for second in (other.select(np.arange(60)), nothing, replace(other, points_world=line), elsewhere):
         result = registered([first, second])
         assert result.outcomes[1] == "too few partners"
@@ -154,7 +149,7 @@ def test_what_lies_elsewhere_or_is_next_to_nothing_stays_as_reported():
 
 def test_a_move_beyond_the_limits_is_refused():
     error = motion(translation_mm=(12.0, -10.0, 4.0))
-    views = [seen_from(180.0, seed=1), put_right(seen_from(120.0, seed=2), error)]
+    views = [seen_from(180.0, seed=1), seen_from(120.0, seed=2).moved(error)]
     result = registered(views, replace(CONFIG, max_translation=0.004))
     assert result.outcomes[1] == "beyond the limits"
     np.testing.assert_array_equal(result.twists[1], 0.0)
@@ -163,7 +158,7 @@ def test_a_move_beyond_the_limits_is_refused():
 def test_a_view_that_is_refused_changes_nothing_for_the_others():
     small, large = motion(translation_mm=(4.0, -3.0, 5.0)), motion(translation_mm=(30.0, -20.0, 12.0))
     views = [seen_from(a, seed=k) for k, a in enumerate((180.0, 140.0, 100.0, 60.0))]
-    views = [put_right(v, e) for v, e in zip(views, (np.eye(4), small, large, small), strict=True)]
+    views = [v.moved(e) for v, e in zip(views, (np.eye(4), small, large, small), strict=True)]
     limited = replace(CONFIG, max_translation=0.03)
     result, without = registered(views, limited), registered([views[0], views[1], views[3]], limited)
     assert result.outcomes[1:] == ["aligned", "beyond the limits", "aligned"]
@@ -177,7 +172,7 @@ def test_views_beyond_those_kept_are_laid_as_well_and_then_stay():
     rng = np.random.default_rng(4)
     angles = (180.0, 150.0, 110.0, 70.0, 30.0, -10.0, -50.0, -90.0, -130.0, -155.0, 165.0, 95.0)
     errors = [np.eye(4), *(drawn_error(rng, 5.0, 0.3) for _ in angles[1:])]
-    views = [put_right(seen_from(a, seed=k), e) for k, (a, e) in enumerate(zip(angles, errors, strict=True))]
+    views = [seen_from(a, seed=k).moved(e) for k, (a, e) in enumerate(zip(angles, errors, strict=True))]
     few, many = ViewRegistration(PIVOT, replace(CONFIG, kept=4)), ViewRegistration(PIVOT, CONFIG)
     sizes = []
     for view in views:
@@ -195,7 +190,7 @@ def test_views_beyond_those_kept_are_laid_as_well_and_then_stay():
 def test_a_copy_goes_on_by_itself_and_alike():
     rng = np.random.default_rng(3)
     views = [
-        put_right(seen_from(a, BOXES, seed=k), drawn_error(rng) if k else np.eye(4))
+        seen_from(a, BOXES, seed=k).moved(drawn_error(rng) if k else np.eye(4))
         for k, a in enumerate((180.0, 0.0, 90.0, 270.0))
     ]
     first = registered(views[:2])
