@@ -31,15 +31,9 @@ def close_hidden_faces(
     on the faces beside it end: at the likeliest end of an even density blurred by the fit's own noise, which
     neither a trimmed share nor the spread of the noise biases. A side without such points stays.
 
-    Args:
-        shape: The shape.
-        seen: The sides that points confirm.
-        points: Its points (N, 3) [m], all finite.
-        config: Limits and thresholds.
-
     Returns:
-        The shape, the mean distance of its points truncated at the threshold [m], the share of them within
-        it, and the uncertainty of the shape.
+        The shape, the mean distance of its points (N, 3) [m], all finite, truncated at the threshold [m],
+        the share of them within it, and the uncertainty of the shape.
     """
     # Of 3 mm of noise, four points sharing an error, 3500 points leave 0.1 mm on a side: far less than the
     # error of registration.

@@ -165,12 +165,9 @@ class Solid(Shape):
         return np.asarray(reach >= reach.max() - depth)
 
     def lengthened(self, direction: Array, depth: float, length: float) -> Solid:
-        """The solid with the corners within a depth [m] of its end along a direction moved on, or back.
+        """The solid with the corners within a depth [m] of its end moved by a length [m], back if negative.
 
-        Args:
-            direction: Unit vector (3,) in the solid's frame.
-            depth: Of the corners that move [m].
-            length: How far they move [m]; backwards if negative.
+        The end and the move are along a unit vector (3,) in the solid's frame.
         """
         moving = np.split(self.lowest(direction, depth), np.cumsum([len(p.vertices) for p in self.polytopes]))
         moved = []

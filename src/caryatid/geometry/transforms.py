@@ -155,12 +155,9 @@ def look_at(eye_world: ArrayLike, target_world: ArrayLike, up_world: ArrayLike =
 def level_world(normal: ArrayLike, point: ArrayLike) -> Array:
     """`T_world_camera` (4, 4) for a frame without a pose, from the support plane seen by the camera.
 
-    World z is the plane's normal, the world's origin is the plane's point below the camera, and world x
-    is the camera's viewing direction projected to the plane.
-
-    Args:
-        normal: Unit normal (3,) of the plane in the camera frame, pointing up.
-        point: Any point (3,) [m] of the plane in the camera frame.
+    World z is the plane's upward unit normal (3,), world x the camera's viewing direction projected to the
+    plane, and the world's origin the plane's point below the camera. The normal and a point (3,) [m] of the
+    plane, any one, are in the camera frame.
     """
     up = unit(normal)
     forward = np.array([0.0, 0.0, 1.0]) - up[2] * up

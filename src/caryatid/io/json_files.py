@@ -100,11 +100,7 @@ def parse_json(
 
 
 def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any]:
-    """Read a file that holds one JSON object.
-
-    Args:
-        path: The file.
-        remedy: What the user can do if it is missing or broken.
+    """Read a file that holds one JSON object; the remedy is what the user can do if it does not.
 
     Raises:
         InputError: The file is missing, unreadable, not JSON, holds NaN or infinity, or is not an object.

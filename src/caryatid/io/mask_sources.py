@@ -44,11 +44,8 @@ def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
 def with_stored_masks(folder: Path, view: View, max_pixels: int) -> View:
     """Return a view with masks from the file named after it: a label image `NAME.png`, or `NAME.npy`.
 
-    Args:
-        folder: Holds the files.
-        view: The view; NAME is its name after the last slash. A `.npy` holds labels (H, W) or a stack of
-            masks (N, H, W), boolean or scores.
-        max_pixels: Maximum number of pixels of a label image.
+    NAME is the view's after the last slash. A `.npy` holds labels (H, W) or a stack of masks (N, H, W),
+    boolean or scores.
 
     Raises:
         InputError: There is no such file, or it is broken or of another size.
@@ -67,10 +64,7 @@ def with_stored_masks(folder: Path, view: View, max_pixels: int) -> View:
 def without_ignored(view: View, ignore: Path, max_pixels: int) -> View:
     """Return a view without the pixels where a mask is not 0, such as those of the robot's own arm.
 
-    Args:
-        view: The view.
-        ignore: A grey PNG for all views of a camera, or a folder with one NAME.png per view.
-        max_pixels: Maximum number of pixels of the mask.
+    The mask is a grey PNG for all views of a camera, or a folder with one NAME.png per view.
 
     Raises:
         InputError: The mask is missing, broken, or of another size.
@@ -90,11 +84,6 @@ class OnnxMasks:
 
     Outputs are `masks` and, optionally, `scores` (N,). Masks are (N, H, W), with any extra axes of length 1:
     boolean, scores in [0, 1], or logits, which are above 0 in the mask.
-
-    Args:
-        path: The model.
-        config: Settings of the automatic segments.
-        seed: Their seed.
 
     Raises:
         InputError: There is no such file, or it has other inputs or outputs.

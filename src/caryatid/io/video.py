@@ -170,11 +170,7 @@ class _Link:
 
 
 class TransformTree:
-    """Poses of frames in their parent frames, for queries between any two frames at any time.
-
-    Args:
-        max_gap: Maximum time between two interpolated poses [s].
-    """
+    """Poses of frames in their parents over time, interpolated across gaps of at most `max_gap` [s]."""
 
     def __init__(self, max_gap: float) -> None:
         self._max_gap = round(max_gap * SECOND)

@@ -68,11 +68,9 @@ def offered() -> dict[str, EntryPoint]:
 
 
 def find_robot(name: str) -> RobotMaker:
-    """Return the maker of a robot.
+    """Return the maker of a robot: `humanoid`, `module:callable`, or a name that another package offers.
 
-    Args:
-        name: `humanoid`; `arm:FILE.npz`, a file of `write_reachability`; `module:callable`; or a name that
-            another package offers.
+    `arm:FILE.npz` is an arm by its file of `write_reachability`.
 
     Raises:
         InputError: There is no such robot, its file is broken, or its module cannot be imported.

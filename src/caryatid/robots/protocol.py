@@ -57,12 +57,9 @@ class OwnViews:
     """Optional methods of a robot, called only if it inherits this class."""
 
     def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
-        """Return the sphere of this robot's views: radius, centre and points.
+        """Return the sphere of this robot's views; proposed is that of the settings around the table top.
 
         Equal arguments give the same sphere. Its own result as the argument gives that result again.
-
-        Args:
-            proposed: The sphere of the settings around the middle of the table top.
         """
         return proposed
 

@@ -18,11 +18,7 @@ from caryatid.sensing.views import View
 
 
 class RecordingRobot(SimulatedRobot):
-    """Reaches each view of a recording once, and begins at the first.
-
-    Args:
-        T_world_cameras: The recorded poses (N, 4, 4), N ≥ 1.
-    """
+    """Reaches each recorded pose (N, 4, 4), N ≥ 1, once, and begins at the first."""
 
     def __init__(self, T_world_cameras: Array | Sequence[Array]) -> None:
         self._recorded = np.array(T_world_cameras, dtype=np.float64)
@@ -63,9 +59,6 @@ class RecordingRobot(SimulatedRobot):
 
 class RecordingCamera:
     """Returns the recorded frame nearest to a pose.
-
-    Args:
-        recording: Frames with poses, or a single frame.
 
     Raises:
         InputError: Several frames of which some have no pose.

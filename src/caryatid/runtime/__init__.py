@@ -10,12 +10,7 @@ from typing import Any
 
 
 def imported_late(package: str, homes: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
-    """Make the `__getattr__` (PEP 562) of a package that imports its names on first use.
-
-    Args:
-        package: Its `__name__`.
-        homes: Module of the package → names in it.
-    """
+    """Make the `__getattr__` (PEP 562) of a package that imports names, listed by module, on first use."""
     module_of = {name: module for module, names in homes.items() for name in names}
 
     def get(name: str) -> Any:

@@ -58,15 +58,11 @@ def one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
 
 
 def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
-    """Call a kernel for each index from 0 to count − 1, on as many threads as numba uses.
+    """Call the kernel `work(index, data)` for each index below a count, on as many threads as numba uses.
 
-    The call for one index must not change the data of another; the result is then the same on any number of
-    threads.
-
-    Args:
-        work: Kernel, called as `work(index, data)` without the GIL; it must not raise.
-        count: Number of indices.
-        data: Arrays and numbers, best a `NamedTuple`; results are written to arrays among them.
+    Data are arrays and numbers, best a `NamedTuple`; results are written to arrays among them. The call for
+    one index must not change the data of another, so that the result is the same on any number of threads.
+    The kernel must not raise.
     """
     compiled = _compiled(work, data)
     on_threads(lambda index: compiled(index, data), count)
@@ -75,9 +71,7 @@ def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
 def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
     """Results of a task for each index from 0 to count − 1, on as many threads as numba uses.
 
-    Args:
-        task: Calls kernels compiled with `nogil=True`; it must not call `on_threads` itself.
-        count: Number of indices.
+    A task calls kernels compiled with `nogil=True`, and must not call `on_threads` itself.
     """
     results: list[Any] = [None] * count
     indices = iter(range(count))

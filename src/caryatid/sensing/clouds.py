@@ -258,13 +258,8 @@ def estimate_normals(points: Array, viewpoint: Array, neighbours: int) -> Array:
 
 
 def thin(points: Array, voxel: float) -> NDArray[np.intp]:
-    """Pick one of the points in each occupied voxel: the one nearest to the mean of its voxel.
+    """Pick one of the points (N, 3) [m] in each occupied voxel: the one nearest to the mean of its voxel.
 
-    Args:
-        points: (N, 3) [m].
-        voxel: Edge length of a voxel [m]; the grid starts at the world's origin.
-
-    Returns:
-        Indices (M,), ascending.
+    Voxels have an edge length [m]; the grid starts at the world's origin. The indices (M,) are ascending.
     """
     return most_central(points, np.zeros(len(points), dtype=np.int32), np.array([voxel]))

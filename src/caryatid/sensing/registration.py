@@ -347,12 +347,7 @@ class _View(NamedTuple):
 
 
 def twist_transform(twist: Array, pivot_world: Array) -> Array:
-    """The rigid transforms (..., 4, 4) that turn about a pivot (3,) [m] and move.
-
-    Args:
-        twist: Twists (..., 6): 3 × m, 3 × rad.
-        pivot_world: The pivot (3,) [m].
-    """
+    """The rigid transforms (..., 4, 4) of twists (..., 6), 3 × m and 3 × rad about a pivot (3,) [m]."""
     x, y, z = np.moveaxis(twist[..., 3:], -1, 0)
     angle = np.sqrt(x * x + y * y + z * z)[..., None, None]
     K = np.zeros((*twist.shape[:-1], 3, 3))

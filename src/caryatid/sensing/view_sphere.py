@@ -39,15 +39,9 @@ class ViewSphere:
         return self.centre_world + self.radius * self.directions
 
     def poses(self, directions: Array) -> Array:
-        """Camera poses that look at the centre without roll.
+        """`T_world_camera` (M, 4, 4) in unit directions (M, 3) from the centre, looking at it without roll.
 
         Straight above and below, where the roll is open, the image's top points along world +x.
-
-        Args:
-            directions: Unit vectors (M, 3) from the centre.
-
-        Returns:
-            `T_world_camera` (M, 4, 4).
         """
         return transforms.look_at(self.centre_world + self.radius * directions, self.centre_world)
 
@@ -57,27 +51,16 @@ class ViewSphere:
 
 
 def spread(direction_from: Array, directions: Array, sigma: float) -> Array:
-    """Fall off with the angle: exp(−angle² / 2σ²), a Gaussian on the sphere.
+    """Gaussians on the sphere, exp(−angle² / 2σ²): values (M, K) in unit directions (M, 3).
 
-    Args:
-        direction_from: Unit vectors (K, 3) of the bumps' tops, where the value is 1.
-        directions: Unit vectors (M, 3).
-        sigma: Angle at which the value has fallen to exp(−½) [rad].
-
-    Returns:
-        (M, K).
+    Their tops, where the value is 1, are unit vectors (K, 3); σ is an angle [rad].
     """
     angle = np.arccos(np.clip(directions @ direction_from.T, -1.0, 1.0))
     return np.exp(-0.5 * (angle / sigma) ** 2)
 
 
 def direction(azimuth: float, elevation: float) -> Array:
-    """Unit vector (3,) with an azimuth and an elevation.
-
-    Args:
-        azimuth: From +x towards +y [rad].
-        elevation: Over the horizontal [rad].
-    """
+    """Unit vector (3,) with an azimuth, from +x towards +y, and an elevation over the horizontal [rad]."""
     return np.array(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     )

@@ -214,24 +214,15 @@ class Camera(Protocol):
     """Takes a view from a pose: simulation, recording or hardware."""
 
     def capture(self, T_world_camera: Array) -> View:
-        """Take a view.
-
-        Args:
-            T_world_camera: Requested camera pose (4, 4); the view holds the pose the camera believes in.
-        """
+        """Take a view from a requested pose (4, 4); it holds the pose the camera believes in."""
         ...
 
 
 def depth_behind(shape: Shape, depth: NDArray[np.float32], K: Array) -> Array:
-    """Distance of readings behind the surface of a shape that faces the camera.
+    """Distances (N,) [m] of readings behind the surface of a shape that faces the camera.
 
-    Args:
-        shape: In the camera frame.
-        depth: Readings (H, W) [m], 0 = none.
-        K: Pinhole matrix (3, 3) [px].
-
-    Returns:
-        Distances (N,) [m] for points about 1 cm apart in the image; −inf without a reading.
+    The shape is in the camera frame; readings (H, W) [m] are 0 where there is none, and K is a pinhole matrix
+    (3, 3) [px]. Distances are at points about 1 cm apart on the shape; −inf without a reading.
     """
     points, outward = shape.surface(0.01)
     facing = np.einsum("ij,ij->i", points, outward) < 0.0
@@ -244,11 +235,7 @@ def depth_behind(shape: Shape, depth: NDArray[np.float32], K: Array) -> Array:
 
 
 def check_intrinsics(K: Array, name: str) -> Array:
-    """Check a pinhole matrix and return it as float64 (3, 3).
-
-    Args:
-        K: Pinhole matrix (3, 3) [px].
-        name: What to call it in the error.
+    """Check a pinhole matrix (3, 3) [px] and return it as float64; the error calls it by a name.
 
     Raises:
         InputError: Wrong shape, NaN, or a focal length that is not positive.

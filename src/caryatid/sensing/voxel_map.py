@@ -96,11 +96,9 @@ class VoxelMap:
         return self.origin_world + self.config.size * np.array(self.hits.shape)
 
     def integrate(self, view: View, max_depth: float) -> VoxelMap:
-        """Return the map with one more view: free along its rays, occupied where they end.
+        """Return the map with one more view, which has a pose: free along its rays, occupied at their ends.
 
-        Args:
-            view: A view with a pose. Pixels without a reading have no effect.
-            max_depth: Readings beyond this count as free space up to this depth [m].
+        Pixels without a reading have no effect; a reading beyond a depth [m] counts as free space up to it.
         """
         config, T_world_camera = self.config, np.ascontiguousarray(view.pose)
         hits, passes = np.zeros_like(self.hits), np.zeros_like(self.passes)
@@ -146,11 +144,7 @@ class VoxelMap:
         return which
 
     def occluders(self, shapes: Sequence[Shape] = ()) -> Occluders:
-        """What blocks lines of sight: the voxels seen occupied, and everything inside the shapes.
-
-        Args:
-            shapes: Fitted shapes in the world frame; their unseen parts block views too.
-        """
+        """What blocks lines of sight: voxels seen occupied, and all that is inside shapes in the world."""
         arrays, size = Primitives.of(shapes), self.config.size
         low, high = ((corner - self.origin_world) / size for corner in arrays.bounds())
         low = np.clip(np.floor(low).astype(np.int64), 0, self.hits.shape)
@@ -227,15 +221,9 @@ class Occluders:
         return _values_at(occluders, points_world, self.origin_world, self.voxels.config.size) > 0
 
     def blocked(self, points_world: Array, targets_world: Array, clearance: float) -> NDArray[np.bool_]:
-        """Test lines of sight.
+        """Whether something is between points (P, 3) and camera positions (T, 3) [m]: (P, T).
 
-        Args:
-            points_world: Points of interest (P, 3) [m].
-            targets_world: Camera positions (T, 3) [m].
-            clearance: Occluding voxels this near to the point do not count [m]: its own surface.
-
-        Returns:
-            (P, T), True if something is in between.
+        Voxels within the clearance [m] of a point do not count: its own surface.
         """
         points, eyes = (np.asarray(x, dtype=np.float64) for x in (points_world, targets_world))
         anywhere, known, worth = np.zeros_like(points), np.zeros(len(points)), np.ones(len(points))
