@@ -7,16 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from synthetic import random_motion
 
 from caryatid.geometry import transforms
 from caryatid.io.video import SECOND, TransformTree, is_pose
 
 NOW = 1_700_000_000 * SECOND
 """Large enough that a float would lose the nanoseconds."""
-
-
-def random_pose(rng):
-    return transforms.rigid(transforms.random_rotation(rng), rng.normal(size=3))
 
 
 def tree_with(*links, gap=1.0):
@@ -31,7 +28,7 @@ def tree_with(*links, gap=1.0):
 @settings(max_examples=30, deadline=None)
 def test_chains_up_and_down_the_tree_multiply(seed):
     rng = np.random.default_rng(seed)
-    A, B, C, D = (random_pose(rng) for _ in range(4))
+    A, B, C, D = (random_motion(rng) for _ in range(4))
     links = ("map", "odom", NOW, A), ("odom", "base", NOW, B), ("odom", "hand", NOW, D)
     tree = tree_with(*links, ("base", "eye", 0, C, True))
     assert np.allclose(tree.between("map", "eye", NOW), A @ B @ C)
@@ -44,7 +41,7 @@ def test_chains_up_and_down_the_tree_multiply(seed):
 @settings(max_examples=30, deadline=None)
 def test_between_two_poses_the_path_is_straight_and_the_turn_even(seed, share):
     rng = np.random.default_rng(seed)
-    start = random_pose(rng)
+    start = random_motion(rng)
     axis, angle, way = transforms.unit(rng.normal(size=3)), rng.uniform(0.0, 3.0), rng.normal(size=3)
 
     def after(part):
@@ -59,7 +56,7 @@ def test_between_two_poses_the_path_is_straight_and_the_turn_even(seed, share):
 
 def test_poses_may_come_in_any_order_and_the_last_of_a_time_counts():
     rng = np.random.default_rng(0)
-    first, last, other = (random_pose(rng) for _ in range(3))
+    first, last, other = (random_motion(rng) for _ in range(3))
     tree = tree_with(
         ("map", "eye", NOW + SECOND, last), ("map", "eye", NOW, other), ("map", "eye", NOW, first)
     )
@@ -70,7 +67,7 @@ def test_poses_may_come_in_any_order_and_the_last_of_a_time_counts():
 @pytest.mark.parametrize("late", [-1, SECOND + 1, 3 * SECOND])
 def test_outside_what_was_said_and_across_a_gap_nothing_is_made_up(late):
     rng = np.random.default_rng(1)
-    links = [("map", "eye", NOW + k * SECOND, random_pose(rng)) for k in (0, 1)]
+    links = [("map", "eye", NOW + k * SECOND, random_motion(rng)) for k in (0, 1)]
     assert tree_with(*links).between("map", "eye", NOW + late) is None
     assert tree_with(*links, gap=1.0).between("map", "eye", NOW + SECOND // 2).shape == (4, 4)
     assert tree_with(*links, gap=0.9).between("map", "eye", NOW + SECOND // 2) is None
@@ -78,7 +75,9 @@ def test_outside_what_was_said_and_across_a_gap_nothing_is_made_up(late):
 
 def test_a_frame_that_changes_its_parent_has_no_pose_in_between():
     rng = np.random.default_rng(3)
-    tree = tree_with(("map", "cup", NOW, random_pose(rng)), ("hand", "cup", NOW + SECOND, random_pose(rng)))
+    tree = tree_with(
+        ("map", "cup", NOW, random_motion(rng)), ("hand", "cup", NOW + SECOND, random_motion(rng))
+    )
     assert tree.between("map", "cup", NOW).shape == (4, 4)
     for target in ("map", "hand"):
         assert tree.between(target, "cup", NOW + 1) is None

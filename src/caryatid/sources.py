@@ -30,9 +30,6 @@ from caryatid.simulation.setup import make_simulation
 
 log = logging.getLogger(__name__)
 
-CLOUD_SUFFIXES = (".pcd", ".ply")
-"""Endings of files that are clouds."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Source:
@@ -59,7 +56,7 @@ def is_recording(source: str) -> bool:
 
 def is_cloud(source: str) -> bool:
     """Whether SOURCE is the name of a cloud."""
-    return find_sample(source).suffix.lower() in CLOUD_SUFFIXES
+    return find_sample(source).suffix.lower() in (".pcd", ".ply")
 
 
 def open_source(

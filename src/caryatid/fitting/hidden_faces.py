@@ -66,10 +66,8 @@ def _close(
     """Put each hidden side (3, 2) of a refined shape (5, 3) where points (N, 3) end, or back where it was.
 
     The shape (5, 3) as it was is replaced by the closed one, unless that is too long; the variances (3, 2)
-    [m²] of the hidden sides are written to.
-
-    Returns:
-        Standard deviation of the points [m], their mean distance [m], and the share of inliers.
+    [m²] of the hidden sides are written to. It returns the points' standard deviation and mean distance [m],
+    and the share of inliers.
     """
     R, middle, half = refined[:3], refined[3].copy(), refined[4]
     distance = np.abs(signed_distances(kind, R, middle, half, points))

@@ -115,11 +115,7 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
         return float(np.linalg.norm(np.diff(driven, axis=0), axis=-1).sum())
 
     def _reach(self, T_world_camera: Array) -> tuple[Indices, Array, Array, Array]:
-        """Find how to stand for poses (N, 4, 4); head yaws are tried from straight ahead outwards.
-
-        Returns:
-            Index of the reason or −1 (N,), platform (N, 3), head yaw (N,) and head pitch (N,).
-        """
+        """Reason's index or −1 (N,), platform (N, 3), head yaw and pitch (N,) of poses (N, 4, 4)."""
         config = self._config
         eyes = T_world_camera[:, :3, 3]
         right, forward = T_world_camera[:, :3, 0], T_world_camera[:, :3, 2]
@@ -127,6 +123,7 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
         # Without roll the right axis is level: it gives the heading even if the view is straight down.
         heading = np.arctan2(right[:, 0], -right[:, 1])
 
+        # Head yaws are tried from straight ahead outwards.
         yaws = np.deg2rad(np.linspace(*config.yaw, config.head_yaws))
         yaws = yaws[np.argsort(np.abs(yaws), kind="stable")]
         quality, best = np.full(len(eyes), -1), np.zeros(len(eyes), dtype=np.intp)
