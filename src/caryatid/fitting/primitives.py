@@ -51,11 +51,7 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class FitFailure:
-    """No shape could be fitted.
-
-    Attributes:
-        reason: Why, for a person to read.
-    """
+    """No shape could be fitted, for a reason that a person reads."""
 
     reason: str
 

@@ -187,7 +187,6 @@ class Box(Shape):
     """A cuboid.
 
     Attributes:
-        kind: `box`, as in graph.json.
         T_world_object: Pose (4, 4) of the centre; axes along the edges.
         extents: Full edge lengths (3,) [m] along the object's x, y, z.
     """
@@ -250,7 +249,6 @@ class Cylinder(Shape):
     """A straight circular cylinder.
 
     Attributes:
-        kind: `cylinder`, as in graph.json.
         T_world_object: Pose (4, 4) of the centre; the axis is the object's z.
         radius: [m].
         height: Full length along the axis [m].
@@ -312,7 +310,6 @@ class Sphere(Shape):
     """A ball.
 
     Attributes:
-        kind: `sphere`, as in graph.json.
         T_world_object: Pose (4, 4) of the centre; its rotation means nothing.
         radius: [m].
     """

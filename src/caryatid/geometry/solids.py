@@ -88,7 +88,6 @@ class Solid(Shape):
     Its axes are the world's where it was first seen; its centre is that of the box around it.
 
     Attributes:
-        kind: `solid`, as in graph.json.
         T_world_object: Pose (4, 4) of its frame.
         polytopes: The parts, in the solid's frame.
     """

@@ -34,10 +34,6 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
     """A humanoid of ARMAR-6's kind in simulation: holonomic platform, torso lift, head with yaw and pitch.
 
     It has no pose at first; its first move has path length 0.
-
-    Args:
-        floor: Free space, and the known furniture.
-        config: Its limits.
     """
 
     def __init__(self, floor: FloorGrid, config: RobotConfig) -> None:

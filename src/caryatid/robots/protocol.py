@@ -19,11 +19,7 @@ from caryatid.sensing.view_sphere import ViewSphere
 
 @dataclass(frozen=True, slots=True)
 class Unreachable:
-    """A pose that the robot cannot reach.
-
-    Attributes:
-        reason: Why, in words for people.
-    """
+    """A pose that the robot cannot reach, and the reason in words for people."""
 
     reason: str
 
