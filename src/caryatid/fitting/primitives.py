@@ -51,7 +51,7 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class FitFailure:
-    """No shape could be fitted, for a reason that a person reads."""
+    """No shape could be fitted; `reason` says why, in words."""
 
     reason: str
 

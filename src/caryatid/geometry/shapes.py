@@ -137,14 +137,14 @@ class Shape(Pictured):
         return points, normals
 
     def mesh(self, corners: int = 48) -> Any:
-        """The shape as a `trimesh.Trimesh` in the object's frame; so many corners stand for a circle."""
+        """The shape as a `trimesh.Trimesh` in the object's frame; circles get this many corners."""
         import trimesh
 
         T_object_world = transforms.invert(self.T_world_object)
         return trimesh.convex.convex_hull(transforms.transform(T_object_world, self.outline()))
 
     def to_trimesh(self, corners: int = 48) -> Any:
-        """The shape as a `trimesh.Trimesh` in the world frame [m]; so many corners stand for a circle."""
+        """The shape as a `trimesh.Trimesh` in the world frame [m]; circles get this many corners."""
         return self.mesh(corners).apply_transform(self.T_world_object)
 
     def lines(self, eye_world: Array) -> list[Array]:

@@ -100,7 +100,7 @@ def parse_json(
 
 
 def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any]:
-    """Read a file that holds one JSON object; the remedy is what the user can do if it does not.
+    """Read a file that holds one JSON object; `remedy` tells the user how to mend it.
 
     Raises:
         InputError: The file is missing, unreadable, not JSON, holds NaN or infinity, or is not an object.
