@@ -12,8 +12,11 @@ planners and settings with confidence intervals.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from operator import call
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -62,20 +65,6 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Task:
-    """What a process of the pool is given: an episode, or single frames to extract.
-
-    Attributes:
-        episode: Scene, segmentation, settings, seed, and how many views.
-        frames: The scene is a BOP folder whose frames are extracted, or a built-in scene, of which a single
-            simulated frame without a pose is.
-    """
-
-    episode: Episode
-    frames: bool = False
-
-
-@dataclass(frozen=True)
 class Suite:
     """Scenes under one setting.
 
@@ -100,13 +89,13 @@ class Suite:
     frames: bool = False
     against: str = ""
 
-    def tasks(self, seeds: int) -> list[Task]:
+    def tasks(self, seeds: int) -> list[Callable[[], list[Row]]]:
         """What is measured, scene by scene."""
-        known = {"segmentation": self.segmentation, "settings": self.settings, "views": max(self.scored)}
+        measure = extract if self.frames else explore
+        base = Episode("", segmentation=self.segmentation, settings=self.settings, views=max(self.scored))
         return [
-            Task(Episode(scene, seed=seed, **known), self.frames)  # type: ignore[arg-type]
-            for scene in self.scenes
-            for seed in range(seeds)
+            partial(measure, replace(base, scene=scene, seed=seed))
+            for scene, seed in product(self.scenes, range(seeds))
         ]
 
 
@@ -125,11 +114,8 @@ SUITES: Mapping[str, Suite] = {
 """`noise` has four times the depth noise, `registration` views that are off by σ = 1 cm and 1°."""
 
 
-def run(task: Task) -> list[Row]:
-    """Rows of one measurement."""
-    episode = task.episode
-    if task.frames:
-        return extract(episode)
+def explore(episode: Episode) -> list[Row]:
+    """Rows of an episode."""
     outcome = run_episode(episode)
     if outcome.error is not None:
         raise CaryatidError(f"{episode.scene}: {outcome.error}")
@@ -137,7 +123,10 @@ def run(task: Task) -> list[Row]:
 
 
 def extract(episode: Episode) -> list[Row]:
-    """Extract a recording, and score the graph after each frame by the pixels of all frames so far."""
+    """Extract a recording, and score the graph after each frame by the pixels of all frames so far.
+
+    The scene is a BOP folder, or a built-in one, of which a simulated frame without a pose is recorded.
+    """
     config = read_settings(None, episode.settings)
     if is_builtin(episode.scene):
         with TemporaryDirectory() as temporary:
@@ -255,7 +244,7 @@ class SuiteRun(Gated):
         names = self.names or tuple(SUITES)
         tasks = [(name, task) for name in names for task in SUITES[name].tasks(self.seeds)]
         rows: dict[str, list[Row]] = {name: [] for name in names}
-        for (name, _), part in zip(tasks, self.each(run, [task for _, task in tasks]), strict=True):
+        for (name, _), part in zip(tasks, self.each(call, [task for _, task in tasks]), strict=True):
             rows[name] += part
         for name in names:
             show_rows(rows[name], console, name)
@@ -277,11 +266,9 @@ class Extract(Spread):
 
     def run(self, console: Console) -> int:
         """Extract and print."""
-        tasks = [
-            Task(Episode(source, segmentation=self.segmentation, settings=self.set), frames=True)
-            for source in self.recordings
-        ]
-        rows = [row for part in self.each(run, tasks) for row in part]
+        known: dict[str, Any] = {"segmentation": self.segmentation, "settings": self.set}
+        episodes = [Episode(source, **known) for source in self.recordings]
+        rows = [row for part in self.each(extract, episodes) for row in part]
         show_rows(rows, console, "extract")
         self.write(rows)
         return 0

@@ -66,12 +66,9 @@ def test_the_baseline_is_of_what_is_measured_and_every_scene_is_built_in():
 
 
 def test_a_recording_is_scored_frame_by_frame(recording):
-    edges = (
-        TrueEdge("table", "object1"),
-        TrueEdge("object1", "object2"),
-    )
+    edges = TrueEdge("table", "object1"), TrueEdge("object1", "object2")
     write_truth(GroundTruth(("table", "object1", "object2"), edges), recording / "gt.json")
-    scored = accuracy.run(accuracy.Task(accuracy.Episode(str(recording)), frames=True))
+    scored = accuracy.extract(accuracy.Episode(str(recording)))
     assert [r["view"] for r in scored] == [1, 2, 3]
     assert all((r["objects"], r["returned"], r["matched"]) == (2, 2, 2) for r in scored[-1:])
     assert scored[-1]["f1"] == 1.0
