@@ -98,9 +98,9 @@ def address_of(said: Path) -> str:
     raise RuntimeError(f"the service does not start: {said.read_text()}")
 
 
-def views_around(scene: str, count: int, seed: int = 0) -> list[View]:
+def views_around(scene: str, count: int) -> list[View]:
     """Views of a scene from around it, with the noise of a Carmine, and depth in whole millimetres."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     camera = SimulatedCamera(load_scene(scene), "carmine", rng=rng, sensor=SENSOR)
     centre_world = np.array([0.0, 0.0, 0.75])
     found = []
@@ -136,6 +136,17 @@ def views_in(session: Path, acknowledged: int, graphs: Sequence[str]) -> int:
     return found
 
 
+def judge(tally: Counter[str], status: int, new: int, said: Path) -> None:
+    """Count what became of one view or report: acknowledged, or killed before or after it was kept."""
+    if status == 0:
+        assert new == 1, "what was acknowledged is lost"
+        tally["acknowledged"] += 1
+    else:
+        assert status == -9, said.read_text()
+        assert new in (0, 1)
+        tally["kept" if new else "not kept"] += 1
+
+
 def kill_adding(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
     """Kill `session add` at random moments; every other time once it has begun to write.
 
@@ -158,18 +169,17 @@ def kill_adding(folder: Path, views: Sequence[View], kills: int, seed: int) -> C
         process = start(["session", "add", session, *options], folder / "said")
         if tally["acknowledged"] == 0:
             process.join()
+        elif sum(tally.values()) % 2 == 1:
+            _wait_for(partial(_any, session / "views", ".partial-*"), 1.1 * usual)
+            time.sleep(chance.uniform(0.0, 0.04))
         else:
-            _wait(session, chance, usual, writing=sum(tally.values()) % 2 == 1)
+            process.join(1.1 * usual * chance.random())
         status = kill(process)
         found = views_in(session, known, graphs)
+        judge(tally, status, found - known, folder / "said")
         if status == 0:
             usual = 0.7 * usual + 0.3 * (time.monotonic() - begun)
-            assert found == known + 1, "a view that was acknowledged is lost"
             assert json.loads((folder / "said").read_text())["view"] == known
-            tally["acknowledged"] += 1
-        else:
-            assert status == -9, (folder / "said").read_text()
-            tally["kept" if found > known else "not kept"] += 1
         known = found
         if known == len(views):
             session, known = folder / f"session-{sum(tally.values())}", 0
@@ -203,26 +213,11 @@ def kill_taking(folder: Path, views: Sequence[View], kills: int, seed: int) -> C
             found = graphs.index(graph_text(opened.graph))
             assert opened.views == len(views)
             assert len(opened.scene.changes) == found
+        judge(tally, status, found - known, folder / "said")
         if status == 0:
             usual = 0.7 * usual + 0.3 * (time.monotonic() - at)
-            assert found == known + 1, "a report that was acknowledged is lost"
-            tally["acknowledged"] += 1
-        else:
-            assert status == -9, (folder / "said").read_text()
-            assert found in (known, known + 1)
-            tally["kept" if found > known else "not kept"] += 1
         known = found
     return tally
-
-
-def _wait(session: Path, chance: random.Random, usual: float, *, writing: bool) -> None:
-    """Wait for a random moment of an `add`: of all its time, or of that after it has begun to write."""
-    end = time.monotonic() + 1.1 * usual * (1.0 if writing else chance.random())
-    while time.monotonic() < end:
-        if writing and any((session / "views").glob(".partial-*")):
-            time.sleep(chance.uniform(0.0, 0.04))
-            return
-        time.sleep(0.0005)
 
 
 def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
@@ -506,15 +501,16 @@ def put_load(
     return orders, seconds, memory, answers
 
 
-KILLS: dict[str, Callable[[Path, Sequence[View], int, int], Counter[str]]] = {
-    "add": kill_adding,
-    "take": kill_taking,
-    "serve": kill_serving,
-    "runs": kill_runs,
-    "clear": kill_clearing,
-    "benchmark": kill_benchmark,
-    "compile": kill_compiling,
+KILLS: dict[str, tuple[Callable[[Path, Sequence[View], int, int], Counter[str]], int]] = {
+    "add": (kill_adding, 1),
+    "take": (kill_taking, 1),
+    "serve": (kill_serving, 1),
+    "runs": (kill_runs, 2),
+    "clear": (kill_clearing, 4),
+    "benchmark": (kill_benchmark, 4),
+    "compile": (kill_compiling, 10),
 }
+"""What is killed, and by how much its kills are divided, because it takes long."""
 
 
 def main(
@@ -540,26 +536,21 @@ def main(
         sessions: Sessions they add to; the service keeps four open.
     """
     around = views_around("clutter", max(12, views))
-    for what, kill_some in KILLS.items():
+    for what, (kill_some, divisor) in KILLS.items():
         if only and what not in only:
             continue
-        begun, share = time.monotonic(), {"runs": 2, "clear": 4, "benchmark": 4, "compile": 10}.get(what, 1)
+        begun = time.monotonic()
         with TemporaryDirectory() as folder:
-            tally = kill_some(Path(folder), around[:12], kills // share, seed)
+            tally = kill_some(Path(folder), around[:12], kills // divisor, seed)
         figures = ", ".join(f"{count} {name}" for name, count in sorted(tally.items()))
         print(f"{what}: {figures}; nothing lost ({time.monotonic() - begun:.0f} s)", flush=True)
     if only and "load" not in only:
         return
-    begun, limit = time.monotonic(), ("--open-sessions", 4)
+    begun = time.monotonic()
+    load: dict[str, Any] = {"clients": clients, "sessions": sessions, "hostile": hostile}
     with TemporaryDirectory() as folder:
-        _, seconds, memory, answers = put_load(
-            Path(folder),
-            around[:views],
-            clients=clients,
-            sessions=sessions,
-            hostile=hostile,
-            options=limit,
-        )
+        options = ("--open-sessions", 4)
+        _, seconds, memory, answers = put_load(Path(folder), around[:views], options=options, **load)
     seconds.sort()
     level = [max(memory[k * views // 5 : (k + 1) * views // 5]) for k in range(5)]
     print(
