@@ -24,7 +24,7 @@ import psutil
 import speed
 import tyro
 from fit_speed import measure_fits
-from measures import gate, print_table, read_baseline, run_main, write_baseline
+from measures import gate, print_table, read_baseline, run_main, update_baseline
 from rich.console import Console
 from rows import FULL, NOTHING, QUICK, Effort, Row, machine, measures, table_of_rows
 from viewer import measure_viewer
@@ -101,14 +101,6 @@ def write_docs(rows: Sequence[Row], folder: Path) -> None:
     (folder / "machine.txt").write_text(f"Run by {about}.\n", encoding="utf-8")
 
 
-def update(rows: Sequence[Row], part: bool) -> None:
-    """Make the ratios the baseline; those of rows not asked for, or without their peer, stay."""
-    fresh = {m.name: m for m in measures(rows)}
-    known = {f"{row.name}{figure}" for row in rows for figure in ("", ".to_peer", ".to_limit")}
-    kept = [m for m in read_baseline(BASELINE) if m.name not in fresh and (part or m.name in known)]
-    write_baseline([*kept, *fresh.values()], BASELINE)
-
-
 def compare(rows_by_name: Mapping[str, Sequence[Row]], part: bool, console: Console) -> int:
     """Compare the ratios with the baseline; returns the exit status.
 
@@ -158,8 +150,9 @@ def main() -> int:
         args.out.write_text(json.dumps(about | {"rows": told}, indent=1) + "\n", encoding="utf-8")
     if args.docs is not None:
         write_docs(rows, args.docs)
-    if args.update:
-        update(rows, bool(args.only))
+    if args.update:  # the ratios of rows not asked for, or without their peer, stay
+        known = {f"{row.name}{figure}" for row in rows for figure in ("", ".to_peer", ".to_limit")}
+        update_baseline(measures(rows), BASELINE, lambda name: bool(args.only) or name in known)
     return compare(rows_by_name, bool(args.only), console) if args.gate else 0
 
 

@@ -65,14 +65,14 @@ class Spread:
 
 @dataclass(frozen=True)
 class OnScenes(Spread):
-    """Options of a benchmark that explores simulated scenes, some of them for goals."""
+    """Options of a benchmark that explores simulated scenes."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Names of built-in scenes, or scene folders."""
     noise: NoiseModel = "carmine"
     """Noise of the simulated camera."""
     seed: int = 0
-    """Seed of the noise and of the choice of goals."""
+    """Seed of the noise and of the choice of objects."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Settings, e.g. `--set active.effort=0.1`."""
 
@@ -122,9 +122,7 @@ class Gated(Spread):
         columns = ["measure", "value", "unit", "better", "± tolerated"]
         print_table(pd.DataFrame(rows, columns=columns), console)
         if self.update:
-            names = {m.name for m in found}
-            others = [m for m in read_baseline(baseline) if m.name not in names and kept(m.name)]
-            write_baseline([*others, *found], baseline)
+            update_baseline(found, baseline, kept)
         return gate(found, baseline, console) if self.gate else 0
 
 
@@ -132,6 +130,13 @@ def write_baseline(measures: Iterable[Measure], path: Path) -> None:
     """Write measures as the baseline to compare with from now on."""
     document = {m.name: asdict(m) for m in measures}
     path.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def update_baseline(found: Sequence[Measure], path: Path, kept: Callable[[str], bool]) -> None:
+    """Write measures as the baseline; others stay there where `kept` says so of their names."""
+    names = {m.name for m in found}
+    others = [m for m in read_baseline(path) if m.name not in names and kept(m.name)]
+    write_baseline([*others, *found], path)
 
 
 def read_baseline(path: Path) -> list[Measure]:
