@@ -15,11 +15,11 @@ from typing import Annotated, Any
 import numpy as np
 import pandas as pd
 import tyro
-from measures import Spread, print_table, run_main
+from measures import OnScenes, print_table, run_main
 from rich.console import Console
 
 from caryatid.benchmark.episodes import open_scene
-from caryatid.config import NoiseModel, SegmentationMethod
+from caryatid.config import SegmentationMethod
 from caryatid.config.settings import read_settings
 from caryatid.evaluation.scores import TrueScene, score
 from caryatid.evaluation.truths import true_scene_from_simulation
@@ -38,7 +38,7 @@ KINDS = ("removed", "moved", "added", "nothing")
 
 
 @dataclass(frozen=True)
-class Args(Spread):
+class Args(OnScenes):
     """Change scenes between two views and see what is noticed."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = PILES
@@ -47,12 +47,6 @@ class Args(Spread):
     """What is done to them."""
     segmentation: SegmentationMethod = "labels"
     """Where segments come from."""
-    noise: NoiseModel = "carmine"
-    """Noise of the simulated camera."""
-    seed: int = 0
-    """Seed of the noise and of the choice of objects."""
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Settings, e.g. `--set registration.enabled=false`."""
 
 
 def measure(task: tuple[str, str, Args]) -> dict[str, Any] | None:
@@ -80,8 +74,7 @@ def measure(task: tuple[str, str, Args]) -> dict[str, Any] | None:
             explorer.go()
         step = explorer.look()
         told += [f"{c.kind} {c.object_id} in view {number + 1}: {c.why}" for c in step.changes]
-        early = number < BEFORE or kind == "nothing"
-        if early:
+        if number < BEFORE or kind == "nothing":
             false = len(told)
     found = score(step.graph, truth_of(simulation.camera.scene))
     noticed = kind == "nothing" or any(t.startswith(kind) for t in told[false:])
@@ -110,11 +103,10 @@ def shifted(scene: SimulatedScene, state: Array, index: int, rng: np.random.Gene
     """The state once an object was set down 12 cm away; None where it falls over, or meets others."""
     names = list(scene.object_bodies.values())
     lifting = Lifting(scene.spec, names)
-    (low, high), top = bounds(scene, index + 1), float(bounds(scene, 0)[1][2])
+    (low, high), table = bounds(scene, index + 1), bounds(scene, 0)
     others = [bounds(scene, k + 1) for k in range(len(names)) if k != index]
-    table = bounds(scene, 0)
     for angle in rng.permutation(8) * np.pi / 4.0:
-        step = np.array([SHIFT * np.cos(angle), SHIFT * np.sin(angle), top + 0.001 - low[2]])
+        step = np.array([SHIFT * np.cos(angle), SHIFT * np.sin(angle), table[1][2] + 0.001 - low[2]])
         a, b = low + step, high + step
         clear = all(((b[:2] + 0.01 < o[0][:2]) | (o[1][:2] < a[:2] - 0.01)).any() for o in others)
         if not clear or (a[:2] < table[0][:2]).any() or (b[:2] > table[1][:2]).any():

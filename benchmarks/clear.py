@@ -114,10 +114,10 @@ def grasped(
     # A body that only follows a mocap body, and is none, has a velocity, so that friction can drag things.
     weld = spec.add_equality(name1="goal", name2="gripper", type=mujoco.mjtEq.mjEQ_WELD, solref=[0.005, 1.0])
     weld.objtype, weld.data = mujoco.mjtObj.mjOBJ_BODY, [*[0.0] * 6, 1.0, *[0.0] * 3, 1.0, 0.0]
-    parts = gripper_boxes(gripper, grasp.width)
+    parts, closing = gripper_boxes(gripper, grasp.width), gripper.kind == "parallel"
     for number, (low, high) in enumerate(parts):
         part = hand
-        if number < len(parts) - 1 and gripper.kind == "parallel":
+        if number < len(parts) - 1 and closing:
             part = hand.add_body(name=f"finger{number}", gravcomp=1.0)
             inwards = [-1.0, 0.0, 0.0] if number == 0 else [1.0, 0.0, 0.0]
             slide = {"type": mujoco.mjtJoint.mjJNT_SLIDE, "axis": inwards, "range": [0.0, gripper.opening]}
@@ -125,24 +125,16 @@ def grasped(
             motor = spec.add_actuator(name=f"finger{number}", target=f"finger{number}")
             motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
         shape = {"type": mujoco.mjtGeom.mjGEOM_BOX, "pos": (low + high) / 2.0, "size": (high - low) / 2.0}
-        part.add_geom(
-            name=f"gripper{number}",
-            density=5000.0,
-            solref=[0.005, 1.0],
-            friction=[1.0, 0.005, 0.0001],
-            condim=4,
-            **shape,
-        )
+        shape |= {"density": 5000.0, "solref": [0.005, 1.0], "friction": [1.0, 0.005, 0.0001], "condim": 4}
+        part.add_geom(name=f"gripper{number}", **shape)
     model = spec.compile()
     data = mujoco.MjData(model)
-    names = list(scene.object_bodies.values())
-    for name, pose in zip(names, state, strict=True):
-        data.qpos[model.jnt_qposadr[model.body(name).jntadr[0]] + np.arange(7)] = pose
+    qpos = {name: model.jnt_qposadr[model.body(name).jntadr[0]] for name in scene.object_bodies.values()}
+    for at, pose in zip(qpos.values(), state, strict=True):
+        data.qpos[at : at + 7] = pose
     own, root = model.body("gripper").id, model.body_rootid[model.geom_bodyid]
     target, touched = model.body(body).id, set[str]()
-    closing = gripper.kind == "parallel"
-    height = data.qpos[model.jnt_qposadr[model.body(body).jntadr[0]] + 2]
-    reach = np.inf
+    height, reach = data.qpos[qpos[body] + 2], np.inf
     for phase, seconds in (("approach", 1.0), ("close", 0.5), ("lift", 1.0)):
         for step in range(round(seconds / 0.002)):
             share = (step + 1) * 0.002 / seconds
@@ -165,7 +157,7 @@ def grasped(
             disc = model.geom("gripper0").id
             solid = np.flatnonzero((root == target) & (model.geom_contype != 0))
             reach = min(mujoco.mj_geomDistance(model, data, disc, int(g), 0.1, None) for g in solid)
-    rise = data.qpos[model.jnt_qposadr[model.body(body).jntadr[0]] + 2] - height
+    rise = data.qpos[qpos[body] + 2] - height
     return sorted(touched), bool(rise > grasp.travel / 2.0 if closing else reach < 0.005)
 
 

@@ -72,13 +72,8 @@ def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
         lift = lifting.lift(poses_of(scene), names.index(bodies[label]), config.lift)
         lifted = {names[k] for k in np.flatnonzero(lift.disturbed)}
         fewer, with_goal = explored(f"o{label}")
-        row = {
-            "scene": name,
-            "goal": f"o{label}",
-            "others": len(names) - 1,
-            "views": fewer,
-            "all views": views,
-        }
+        row = {"scene": name, "goal": f"o{label}", "others": len(names) - 1}
+        row |= {"views": fewer, "all views": views}
         for which, found in (("", with_goal), ("all ", graph)):
             moves = predicted(found, f"o{label}", truth, config)
             for how, true in (("taken", taken), ("lifted", lifted)):

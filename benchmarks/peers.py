@@ -71,9 +71,7 @@ def open3d_chain(view: View, max_depth: float) -> Callable[[], int]:
     """Open3D from a depth image, readings up to a depth [m], to a box a cluster, counting the boxes."""
     o3d = _open3d()
     height, width = view.depth.shape
-    K = o3d.camera.PinholeCameraIntrinsic(
-        width, height, view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]
-    )
+    K = o3d.camera.PinholeCameraIntrinsic(width, height, view.K)
 
     def chain() -> int:
         image = o3d.geometry.Image(view.depth)
@@ -102,13 +100,13 @@ def open3d_box(points: Array) -> Callable[[], Estimate]:
     return lambda: {"extents": np.asarray(cloud.get_minimal_oriented_bounding_box().extent)}
 
 
-def pyransac3d_fit(kind: str, points: Array, iterations: int = ITERATIONS) -> Callable[[], Estimate]:
+def pyransac3d_fit(kind: str, points: Array) -> Callable[[], Estimate]:
     """pyransac3d's fit of a `box`, `cylinder` or `sphere` to points (N, 3) [m]."""
     library = import_module(PYRANSAC3D)
 
     def call() -> Estimate:
         random.seed(0)
-        options = {"thresh": THRESHOLD, "maxIteration": iterations}
+        options = {"thresh": THRESHOLD, "maxIteration": ITERATIONS}
         if kind == "box":
             return {"extents": np.asarray(library.Cuboid().fit(points, **options).extents)}
         if kind == "sphere":

@@ -63,25 +63,13 @@ def measure_viewer(effort: Effort) -> list[Row]:
 
     value, spread = median([1e3 * t for t in shown])
     what = f"from a view of {POINTS:,} points to its arrival in the browser"
+    more, share = f"memory of one more view of {POINTS:,} points", 100.0 * cost / exploring
     growth = (sizes[-1] - sizes[0]) / (counts[-1] - counts[0])
     note = "; ".join(f"{size:.0f} MB after {n} views" for n, size in zip(counts, sizes, strict=True))
     return [
         Row("viewer.shown", what, value, "ms", spread, len(shown), target=SHOWN),
-        Row(
-            "viewer.cost",
-            "CPU time of an exploration for its page",
-            100.0 * cost / exploring,
-            "%",
-            target=COST,
-        ),
-        Row(
-            "viewer.memory",
-            f"memory of one more view of {POINTS:,} points",
-            growth,
-            "MB",
-            target=GROWTH,
-            note=note,
-        ),
+        Row("viewer.cost", "CPU time of an exploration for its page", share, "%", target=COST),
+        Row("viewer.memory", more, growth, "MB", target=GROWTH, note=note),
     ]
 
 
