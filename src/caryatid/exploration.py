@@ -248,8 +248,7 @@ class Explorer:
         candidates: Candidates | None = None
         try:
             candidates = robot.candidates(step.sphere)
-            state = self._state(candidates)
-            decision, candidates = _decide(state, robot, self._planner, self.scene.seed)
+            decision, candidates = _decide(self._state(candidates), robot, self._planner, self.scene.seed)
         except PlanningError as error:
             stop = str(error)
         watch.lap("plan")
@@ -321,7 +320,7 @@ class Explorer:
 
     def _state(self, candidates: Candidates) -> PlanningState:
         step = self._newest()
-        return replace(_state(self.scene, step.sphere, step.visited, candidates), goal=self.goal)
+        return _state(self.scene, step.sphere, step.visited, candidates, self.goal)
 
     def _robot_pose(self) -> RobotPose | None:
         robot, footprint = self.robot, self.scene.config.robot.footprint
@@ -508,7 +507,8 @@ def _decide(
     raise PlanningError(f"the robot refused {ATTEMPTS} views in a row: {why}")
 
 
-def _state(scene: Scene, sphere: ViewSphere, visited: Array, candidates: Candidates) -> PlanningState:
-    if scene.voxels is None:
-        raise PlanningError("the scene has no views; update it with a first view")
-    return PlanningState(scene.graph, sphere, scene.voxels, visited, candidates, scene.config.active)
+def _state(
+    scene: Scene, sphere: ViewSphere, visited: Array, candidates: Candidates, goal: str | None = None
+) -> PlanningState:
+    assert scene.voxels is not None
+    return PlanningState(scene.graph, sphere, scene.voxels, visited, candidates, scene.config.active, goal)

@@ -61,7 +61,7 @@ class RunCommand(options.ComputingCommand):
         with RunWriter(self.out, config, _about(self)) as writer:
             name, truth, steps = self.open(config)
             writer.more["conditions"] = conditions = _conditions(self)
-            graph = _record(writer, steps, truth, output, page, f"{name}: {conditions}").graph
+            graph = _record(writer, steps, truth, output, f"{name}: {conditions}", page).graph
         if not self.no_report:
             _draw_report(self.out, output)
         output.say(f"{name}: {census(graph)} after {count_of(len(writer.steps), 'view')}")
@@ -187,10 +187,9 @@ class View(options.ExploringCommand):
         from caryatid.viewer.page import Page
 
         run = read_run(self.source)
-        steps = read_steps(run)
+        steps, scores = read_steps(run), [score["f1"] for score in run.record.get("scores", ())]
         title = f"caryatid: {run.folder.name}"
         page = Page(title, read_config(run).support, host=self.host, port=self.port)
-        scores = [score["f1"] for score in run.record.get("scores", ())]
         for step in steps:
             page.add(step, scores[step.index] if scores else None)
         return page
@@ -199,12 +198,8 @@ class View(options.ExploringCommand):
         from caryatid.viewer.loop import LoopPage
 
         masks = self.mask_source(config)
-        known: dict[str, Any] = {
-            "segmentation": self.segmentation,
-            "seed": self.settings.seed,
-            "masks": masks,
-        }
-        known |= {"planner": self.chosen_planner, "host": self.host, "port": self.port}
+        known: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
+        known |= {"masks": masks, "planner": self.chosen_planner, "host": self.host, "port": self.port}
         with self.output.working("opening"):
             page = LoopPage(_opening(self, masks), config, **known)
         page.start()
@@ -336,7 +331,7 @@ class Clear(options.ExploringCommand):
             known = {"goal": self.goal, "hands": self.hands, "threads": cores()}
             steps = clear(explorer, take, past=() if past is None else read_steps(past), **known)
             writer.more["conditions"] = conditions = _conditions(self)
-            last = _record(writer, steps, None, output, heading=f"{source.name}: {conditions}")
+            last = _record(writer, steps, None, output, f"{source.name}: {conditions}")
         if not self.no_report:
             _draw_report(self.out, output)
         harmed = sorted({body for lift in lifts for body in lift["disturbed"]})
@@ -417,8 +412,8 @@ def _record(
     steps: Iterable[Step],
     truth: TrueScene | None,
     output: Output,
+    heading: str,
     page: PageProcess | None = None,
-    heading: str = "",
 ) -> Step:
     """Score, save, print and show every step; return the last."""
     from caryatid.evaluation.scores import score
@@ -428,7 +423,7 @@ def _record(
     for step in steps:
         scored = None if truth is None else score(step.graph, truth)
         writer.add(step, None if scored is None else asdict(scored))
-        if heading and last is None:
+        if last is None:
             output.say(heading)
         output.step(step, None if last is None else last.graph, scored)
         if page is not None:

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from caryatid.errors import PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
@@ -68,13 +67,9 @@ class Reachable:
 
 
 def table_floor(scene: Scene) -> FloorGrid:
-    """The floor around the table; the area under the table top is blocked.
-
-    Raises:
-        PlanningError: The scene has no views.
-    """
-    if scene.surface is None or scene.sphere is None:
-        raise PlanningError("the session has no views; add a first view")
+    """The floor around the table of a scene; the area under the table top is blocked."""
+    assert scene.surface is not None
+    assert scene.sphere is not None
     shape = scene.surface.shape
     top = float(scene.surface.point_world[2])
     T_world_box = transforms.rigid(shape.T_world_object[:3, :3], (*shape.T_world_object[:2, 3], top / 2.0))
