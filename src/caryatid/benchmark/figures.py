@@ -50,14 +50,7 @@ class Figure:
 
 
 def draw_group(group: pd.DataFrame, measure: str, heading: str, reference: str) -> Iterator[Figure]:
-    """Draw the methods under one condition, in all scenes or in those of one family.
-
-    Args:
-        group: Its rows of a suite's summary.
-        measure: The quantity, such as `f1`.
-        heading: Label of the axis.
-        reference: Reference method of the differences.
-    """
+    """Draw a measure, such as `f1`, of the methods under one condition, in all scenes or one family's."""
     family = group["family"].iloc[0]
     scenes = f"{family or 'all'} scenes"
     curves, path = curves_of(group, measure), curves_of(group, "path")

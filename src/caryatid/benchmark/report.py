@@ -125,19 +125,13 @@ class SuiteResult:
 def write_report(
     store: ResultStore, folder: Path, *, reference: str | None = None, document: Path | None = None
 ) -> list[SuiteResult]:
-    """Write tables, figures and a page of all results.
-
-    Args:
-        store: The results.
-        folder: Where to write.
-        reference: Method with which the others are compared, instead of the suites' own.
-        document: Markdown document to write as well.
+    """Write tables, figures and a page of all results, and a Markdown document if asked for.
 
     Returns:
         The suites with at least one episode.
 
     Raises:
-        InputError: No suite has such a method, or pandas is not installed.
+        InputError: No suite has the reference, or pandas is not installed.
     """
     results = summarise_store(store, reference)
     _write_tables(store, folder)
@@ -153,15 +147,10 @@ def write_report(
 
 
 def summarise_store(store: ResultStore, reference: str | None = None) -> list[SuiteResult]:
-    """Summarise every suite with at least one episode.
-
-    Args:
-        store: The results.
-        reference: Method with which the others are compared, in the suites that have it, instead of the
-            suite's.
+    """Summarise every suite with at least one episode; the reference replaces that of suites that have it.
 
     Raises:
-        InputError: No suite has such a method, or pandas is not installed.
+        InputError: No suite has the reference, or pandas is not installed.
     """
     check_reference(reference, store)
     results = []

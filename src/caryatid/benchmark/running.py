@@ -64,13 +64,9 @@ def run_on_cluster(
     tell: Callable[[str], None] = lambda text: None,
     patience: float = 10.0,
 ) -> Outcomes:
-    """Run episodes on a scheduler's workers; yield each with its outcome as soon as it is done.
+    """Run episodes on the workers of a scheduler, which must answer within `patience` [s].
 
-    Args:
-        episodes: What to run.
-        address: Of the scheduler.
-        tell: Called with a line of text if there are no workers.
-        patience: Maximum time for the scheduler to answer [s].
+    Yields each with its outcome as soon as it is done; tells if there are no workers.
 
     Raises:
         InputError: No scheduler answers.
@@ -121,12 +117,8 @@ def connect(address: str, patience: float = 10.0) -> Client:
 def run_on_worker(episode: Episode, code: str) -> Outcome:
     """Run an episode in a process of a pool or cluster, one at a time and on one thread.
 
-    Args:
-        episode: What to run; a scene folder must be readable here.
-        code: Fingerprint the worker's code must have.
-
     Raises:
-        CaryatidError: The worker has other code, or another package that offers the planner.
+        CaryatidError: The fingerprint of the worker's code is another, or the package of the planner is.
     """
     from numba import set_num_threads
 
@@ -176,16 +168,13 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Delay Ctrl-C while processes are started; the processes never receive it, so they end quietly.
-
-    They inherit the mask. Here the handler delays Ctrl-C, because another thread might receive it despite the
-    mask, and half-started processes would be left behind. An ignored Ctrl-C, as in the background of a shell,
-    stays ignored.
-    """
+    """Delay Ctrl-C while processes are started; the processes never receive it, so they end quietly."""
     if current_thread() is not main_thread() or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         yield
         return
     held: list[int] = []
+    # The processes inherit the mask. Here another thread might receive Ctrl-C despite it, and half-started
+    # processes would be left behind, so a handler delays it.
     handler = signal.signal(signal.SIGINT, lambda number, frame: held.append(number))
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

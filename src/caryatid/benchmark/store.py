@@ -101,13 +101,8 @@ class ResultStore:
     def plan(self, suite: str, members: Sequence[Member], *, retry: bool = False) -> list[Episode]:
         """Record the members of a suite, instead of an earlier plan.
 
-        Args:
-            suite: Its name.
-            members: Its episodes.
-            retry: Run failed episodes again.
-
         Returns:
-            The episodes that are missing, each once, in order.
+            The episodes that are missing (with `retry` also those that failed), each once, in order.
         """
         if self.suites.get(suite) != list(members):
             self._append({"suite": suite, "members": [asdict(m) for m in members]})

@@ -23,12 +23,7 @@ if TYPE_CHECKING:
 
 
 def shown(metavar: str | None = None, default: object = "") -> object:
-    """An option whose help shows no default, or a given one.
-
-    Args:
-        metavar: Name of its value in the help; None = that of its type.
-        default: Default to show.
-    """
+    """An option whose help shows no default, or a given one; `metavar` replaces the name of its type."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})" if default else "")
 
 
@@ -40,11 +35,7 @@ def default_of(setting: str, metavar: str | None = None) -> object:
 
 
 def one_of(choice: Any) -> PrimitiveConstructorSpec[Any]:
-    """One of a few words, or None if omitted; anything else is a usage error that lists them.
-
-    Args:
-        choice: The words, or a Literal of them.
-    """
+    """One of a few words (or of a Literal), or None if omitted; all else is a usage error that lists them."""
     words: tuple[str, ...] = get_args(choice) or choice
     return _word("{" + ",".join(words) + "}", str, words)
 
@@ -154,13 +145,9 @@ class Modelling(Settings):
     ) -> Config:
         """The configuration, as `Settings.read` returns it, with the options here.
 
-        Args:
-            options: As for `Settings.read`.
-            base: As for `Settings.read`.
-            takes_views: Whether the command reads views, whose masks may come from a model or folder.
-
         Raises:
-            InputError: As for `Settings.read`; or masks are given and the command reads no views.
+            InputError: As for `Settings.read`; or masks come from a model or folder, and the command does not
+                take views.
         """
         from caryatid.config.settings import preset
 

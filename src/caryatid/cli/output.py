@@ -116,11 +116,7 @@ def table(
 
 
 def profile(steps: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], Table]:
-    """Times of all stages of each view [s] for `--profile`, and the same as a table [ms].
-
-    Args:
-        steps: Number and timings [s] of each view, as in run.json.
-    """
+    """Times of all stages of each view [s], from the steps in run.json, and the same as a table [ms]."""
     stages = [*dict.fromkeys(stage for step in steps for stage in step["timings"]), "turn"]
     views = [{"view": s["view"]} | s["timings"] | {"turn": turn(s["timings"])} for s in steps]
     times = {f"{view['view'] + 1}": view for view in views}

@@ -212,14 +212,7 @@ class Export(options.Command):
 
 
 def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
-    """Draw the report of a run folder and write its report.html.
-
-    Args:
-        folder: The run.
-        pdf: File of the PDF, or None.
-
-    Returns:
-        The files written.
+    """Draw the report of a run folder; write its report.html, and a PDF if asked for; return their paths.
 
     Raises:
         InputError: It is not a run, a file in it is broken, or a file cannot be written; an existing

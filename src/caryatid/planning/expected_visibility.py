@@ -79,11 +79,9 @@ def surface_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
 
 
 def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | None:
-    """Find the box over the table that may hold something, up to the height of the highest object.
+    """Find the box over the table, within the map, that may hold something, up to the highest object's top.
 
-    Args:
-        graph: The objects and the table.
-        voxels: Bounds the box; it begins two voxels over the table, clear of readings of its top.
+    It begins two voxels over the table, clear of readings of its top.
 
     Returns:
         Its corners (3,) and (3,) [m], or None without a table, objects, or space between them.

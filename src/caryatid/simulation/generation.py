@@ -308,10 +308,7 @@ def _turned(shape: Shape, turn: Array) -> Shape:
 
 
 def _pushed(shape: Shape, outward_world: Array, others: Sequence[Shape]) -> Shape:
-    """Push a shape over the table from outside towards the middle, until it touches another one.
-
-    Before they settle, `CLOSE` stays between them.
-    """
+    """Push a shape over the table from outside towards the middle, until it is `CLOSE` to another one."""
     z = TABLE_HEIGHT + float(shape.support(np.array([[0.0, 0.0, -1.0]]))[0]) + CLOSE
     distance = float(np.hypot(*TABLE_SIZE))
     for _ in range(60):

@@ -104,14 +104,10 @@ class Lifting:
         held: Collection[int] = (),
         to_the_end: bool = True,
     ) -> Lift:
-        """Lift an object straight up, put it aside and observe the others.
+        """Lift an object of a state (N, 7) straight up, put it aside and observe the others.
 
-        Args:
-            state: Initial state (N, 7).
-            index: Index of the object.
-            config: Parameters of the lift, and what counts as harm.
-            held: Objects that are held in place meanwhile.
-            to_the_end: False stops as soon as an object is disturbed or all are at rest.
+        Some objects may be held in place meanwhile. If it need not go on to the end, it stops as soon as an
+        object is disturbed or all are at rest.
         """
         watched = state[:, 2] < ASIDE / 2.0
         watched[index] = False

@@ -156,11 +156,7 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
 
 
 def _check_sizes(path: Path, config: PhysicsConfig) -> None:
-    """Refuse a file that would exhaust memory when MuJoCo expands it.
-
-    Raises:
-        InputError: An element makes too many copies, or a height field or texture is too large.
-    """
+    """Refuse a file that would exhaust memory when MuJoCo expands it: too many copies, too large fields."""
     copies = [1.0]
     # MuJoCo itself refuses bad XML and numbers, and names the line.
     with suppress(ElementTree.ParseError, ValueError, OSError):

@@ -21,9 +21,8 @@ from caryatid.simulation.setup import Simulation, make_simulation
 def warm_up(number: int) -> None:
     """Fit shapes, explore with and without fits and given segments, use all planners, and take a point cloud.
 
-    Args:
-        number: Decides which of these comes first; the others follow in turn. Fitting takes nearly as long to
-            compile as all the rest, so another process begins with what needs no fits.
+    The number decides which of these comes first; the others follow in turn. Fitting takes nearly as long to
+    compile as all the rest, so another process begins with what needs no fits.
     """
     parts = [_explore_without_fits, _explore_by_colour_and_depth, _explore_with_labels, _fit]
     for n in range(len(parts)):

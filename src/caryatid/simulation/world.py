@@ -120,10 +120,7 @@ def scene_from_spec(
 
 
 def _settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: float) -> bool:
-    """Simulate until nothing moves, and return whether that was in time; changes the data.
-
-    A state at rest does not change, unless a minimum time `least` [s] is simulated.
-    """
+    """Simulate, at least for a time [s], until nothing moves; return whether that was in time."""
     window = max(1, round(config.rest_window / model.opt.timestep))
     kinds = mujoco.mjtWarning
     blown_up = kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC

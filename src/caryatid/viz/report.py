@@ -191,15 +191,7 @@ def _in_words(change: Change) -> str:
 def _answer(
     step: Step, shown: Step, views: int, score: Mapping[str, Any] | None, width: int
 ) -> Iterator[Section]:
-    """The final graph beside the view that shows most objects, in 3D, and what is uncertain.
-
-    Args:
-        step: The last step.
-        shown: The step whose view is shown.
-        views: How many there were.
-        score: What the last `Score` says by name, or None.
-        width: Of the picture [px].
-    """
+    """The final graph beside the view of the step that shows most objects, in 3D, and what is uncertain."""
     graph, truth, facts = step.graph, score or {}, []
     text = f"{census(graph)} after {count_of(views, 'view')}."
     if score is not None:
