@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from caryatid.config import ActiveVisionConfig
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.sensing.view_sphere import ViewSphere, spread
+from caryatid.sensing.voxel_map import VoxelMap
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -118,6 +120,13 @@ def surface_point(shape: Shape, towards_world: Array) -> Array:
         else:
             outside = t
     return centre + inside * (towards_world - centre)
+
+
+def hidden_from(eyes_world: Array, points: Sequence[PointOfInterest], voxels: VoxelMap) -> NDArray[np.bool_]:
+    """Which points (K,) something seen occupied hides from eyes (N, 3) [m]: (K, N)."""
+    positions = np.array([p.position_world for p in points]).reshape(-1, 3)
+    # The line of sight leaves the neighbourhood of its point first: 5 cm, half a common object.
+    return voxels.occluders().blocked(positions, eyes_world, 0.05)
 
 
 def painted(points: Sequence[PointOfInterest], directions: Array, sigma: float) -> Array:

@@ -14,6 +14,7 @@ from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
 from caryatid.planning.points_of_interest import (
     PointOfInterest,
+    hidden_from,
     inhibition_of_return,
     painted,
     points_of_interest,
@@ -39,7 +40,9 @@ class PaperPlanner:
         points = points_of_interest(state.graph, state.sphere, state.visited, config)
         points = [_at_reachable_height(point, state.candidates) for point in points]
         added = [p for p in points if _reachable(p.direction, state)]
-        hidden = _hidden(added, state)
+        ends = np.array([p.direction for p in added]).reshape(-1, 3)
+        eyes_world = state.sphere.centre_world + state.sphere.radius * ends
+        hidden = np.diag(hidden_from(eyes_world, added, state.voxels))
         saliency, strongest = _saliency(added, hidden, state.visited, state.candidates.directions, config)
 
         def why(best: int) -> str:
@@ -75,15 +78,6 @@ def _reachable(direction: Array, state: PlanningState) -> bool:
     # Off its points: within their mean spacing.
     angle = np.arccos(np.clip(candidates.directions[nearest] @ direction, -1.0, 1.0))
     return bool(angle <= np.sqrt(4.0 * np.pi / len(state.sphere.directions)))
-
-
-def _hidden(points: list[PointOfInterest], state: PlanningState) -> NDArray[np.bool_]:
-    """Whether something stands between each point (K,) and its projection on the view sphere."""
-    positions = np.array([p.position_world for p in points]).reshape(-1, 3)
-    directions = np.array([p.direction for p in points]).reshape(-1, 3)
-    eyes_world = state.sphere.centre_world + state.sphere.radius * directions
-    # The line of sight leaves the neighbourhood of its point first: 5 cm, half a common object.
-    return np.diag(state.voxels.occluders().blocked(positions, eyes_world, 0.05))
 
 
 def _on_sphere(

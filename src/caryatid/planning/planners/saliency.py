@@ -13,6 +13,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
 from caryatid.planning.points_of_interest import (
     PointOfInterest,
+    hidden_from,
     inhibition_of_return,
     painted,
     points_of_interest,
@@ -36,7 +37,10 @@ class AttentionPlanner:
         check_candidates(state)
         config, directions, visited = state.config, state.candidates.directions, state.visited
         points = points_of_interest(state.graph, state.sphere, visited, config)
-        saliency, strongest = _largest(points, directions, config, _hidden(points, state))
+        hidden = None
+        if points and config.occlusion != "ignore":
+            hidden = hidden_from(state.candidates.T_world_camera[:, :3, 3], points, state.voxels).T
+        saliency, strongest = _largest(points, directions, config, hidden)
 
         def why(best: int) -> str:
             if strongest[best] < 0:
@@ -85,13 +89,3 @@ def _largest(
     largest = counted.max(axis=1)
     strongest = np.where(largest > -np.inf, counted.argmax(axis=1), -1)
     return np.where(strongest < 0, 0.0, largest), strongest
-
-
-def _hidden(points: Sequence[PointOfInterest], state: PlanningState) -> NDArray[np.bool_] | None:
-    """Which points are hidden from which candidates (N, K); None if that does not matter."""
-    if not points or state.config.occlusion == "ignore":
-        return None
-    positions = np.stack([p.position_world for p in points])
-    # The line of sight leaves the neighbourhood of its point first: 5 cm, half a common object.
-    eyes_world = state.candidates.T_world_camera[:, :3, 3]
-    return state.voxels.occluders().blocked(positions, eyes_world, 0.05).T
