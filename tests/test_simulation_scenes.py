@@ -12,7 +12,7 @@ import pytest
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box
+from caryatid.geometry.shapes import Box, Shape
 from caryatid.simulation import (
     GroundTruth,
     SimulatedScene,
@@ -220,12 +220,16 @@ def test_dense_scenes_have_screens_a_heap_and_walls(size: int, seed: int):
     assert all(x > 0.5 or abs(y) > 0.7 for x, y in walls)
 
 
-def test_packed_objects_touch_one_another():
-    shapes = list(true_shapes(generate("packed", 6, 3)).values())
+def assert_close(shapes: list[Shape], most: float) -> None:
+    """Every shape touches another one, or is at most this far from it [m]."""
     for shape in shapes:
         surface = shape.surface(0.003)[0]
         gaps = [float(other.signed_distance(surface).min()) for other in shapes if other is not shape]
-        assert -0.002 < min(gaps) < 0.004
+        assert -0.002 < min(gaps) < most
+
+
+def test_packed_objects_touch_one_another():
+    assert_close(list(true_shapes(generate("packed", 6, 3)).values()), 0.004)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -234,10 +238,7 @@ def test_blocks_are_equal_boxes_close_to_one_another(seed: int):
     assert_settled(scene)
     shapes = list(true_shapes(scene).values())
     assert all(isinstance(s, Box) and (s.extents == shapes[0].extents).all() for s in shapes)
-    for shape in shapes:
-        surface = shape.surface(0.003)[0]
-        gaps = [float(other.signed_distance(surface).min()) for other in shapes if other is not shape]
-        assert -0.002 < min(gaps) < 0.016
+    assert_close(shapes, 0.016)
 
 
 @pytest.mark.slow
@@ -252,11 +253,11 @@ def test_generated_names_repeat_byte_for_byte(name: str):
 def test_sizes_and_seeds_out_of_range_are_refused(name: str):
     with pytest.raises(InputError, match=r"give \d+ to \d+"):
         load_scene(name)
+
+
+def test_names_and_seeds():
     with pytest.raises(InputError, match="negative"):
         generate("pile", 3, -1)
-
-
-def test_names():
     assert list(list_scenes())[: len(DESIGNED)] == list(DESIGNED)
     assert is_builtin("clutter")
     assert is_builtin("pile-8-3")

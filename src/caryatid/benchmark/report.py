@@ -92,15 +92,10 @@ img {{ width: min(100%, 620px); background: #fff; }}
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SuiteResult:
-    """Data of one suite for tables and figures, without its episodes.
+    """Data of one suite for tables and figures: numbers of its episodes, scenes and seeds, and the summary.
 
     Attributes:
-        name: Of the suite.
-        reference: Method the others are compared with.
-        planned: Number of planned episodes.
         episodes: Number of finished episodes, including failed ones.
-        scenes: Number of scenes.
-        seeds: Number of seeds.
         failures: Method, condition, scene, seed and error of each failed episode.
         summary: As `summarise` returns it.
     """

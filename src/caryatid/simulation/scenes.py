@@ -113,7 +113,7 @@ _SIZED: Final[Mapping[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Elements of MJCF that may take much memory → the attributes that say how much."""
 
-_GENERATED = re.compile(r"(pile|dense|packed|house|blocks)-(\d+)-(\d+)")
+_GENERATED = re.compile(rf"({'|'.join(SIZES)})-(\d+)-(\d+)")
 
 
 def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None) -> SimulatedScene:
