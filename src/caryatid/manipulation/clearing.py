@@ -29,8 +29,9 @@ def clear(
 
     A lift is safe if no other object moves with a probability above `config.rehearsal.risk`, as in
     `plan_order`; with a gripper, it also needs a grasp. It is carried out when no view of what it depends on
-    is worth its path, or after `config.active.max_views` views since the previous lift. After each lift the
-    robot looks again, and so detects objects that slid or fell.
+    is worth its path. As long as no lift is safe, the robot looks on; both end after
+    `config.active.max_views` views since the previous lift. After each lift the robot looks again, and so
+    detects objects that slid or fell.
 
     Args:
         explorer: Explorer with a camera and a robot, without a goal.
@@ -82,21 +83,25 @@ def _lift(
     ids = [o.id for o in scene.graph.objects if o.role == "object"]
     if not ids and goal is None:
         return None, "no objects are left"
-    lift, missing = None, f"{goal} was not found"
-    if goal is None or goal in ids:
+    lift, missing, found = None, f"{goal} was not found", goal is None or goal in ids
+    if found:
         known: Any = {"goal": goal, "hands": hands, "seed": scene.seed, "threads": threads}
         order = plan_order(
             scene.graph, scene.config, steps=1, voxels=scene.voxels, reachable=reachable, **known
         )
         lift, missing = next(iter(order.steps), None), order.refusal
-    explorer.goal = lift.object_id if lift is not None and lift.safe else goal
+    safe = lift is not None and lift.safe
+    explorer.goal = lift.object_id if lift is not None and safe else None
     explorer.plan()
-    reason = used_up(views, scene.config.active) or explorer.reason_to_stop()
+    assert explorer.step is not None
+    # Where no lift is safe, a view that shows little is worth its path too.
+    enough = explorer.reason_to_stop() if safe or not found else explorer.step.stop
+    reason = used_up(views, scene.config.active) or enough
     if reason is None:
         return None, None
     if lift is None:
         return None, f"{reason}; {missing}"
-    return (lift, None) if lift.safe else (None, f"no lift is safe: {lift.why}")
+    return (lift, None) if safe else (None, f"no lift is safe: {lift.why}")
 
 
 def _repeat(explorer: Explorer, step: Step) -> None:
