@@ -353,7 +353,7 @@ def test_view_serves_a_run_to_this_machine_until_it_is_stopped(scene_file, tmp_p
     monkeypatch.setattr(Page, "add", lambda page, *step: (shown.append(step), add(page, *step)))
 
     def meanwhile():
-        address = capsys.readouterr().err.split(" at ")[-1].split(";")[0]
+        address = re.search(r"http://\S+", capsys.readouterr().err)[0]  # what programs take for the address
         served.append((address, urllib.request.urlopen(address).read()))
 
     _waiting(monkeypatch, meanwhile)

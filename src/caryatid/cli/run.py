@@ -177,7 +177,8 @@ class View(options.ExploringCommand):
         sys.setswitchinterval(0.0005)
         with closing(self._open_run() if is_run(Path(self.source)) else self._open_loop(config)) as page:
             output.result({"address": page.url, "source": self.source}, "")
-            output.say(f"{self.source} at {page.url}; press Ctrl-C to quit")
+            output.say(f"{self.source} at {page.url}")
+            output.say("press Ctrl-C to quit")
             if not self.no_browser:
                 webbrowser.open(page.url)
             wait_for_interrupt()
@@ -377,7 +378,7 @@ def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]
     webbrowser.open(page.url)
     try:
         yield page
-        output.say(f"finished; the page stays open at {page.url}, press Ctrl-C to quit")
+        output.say("finished; the page stays open, press Ctrl-C to quit")
         wait_for_interrupt()
     finally:
         page.close()
