@@ -17,6 +17,7 @@ os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 import numba
 import numpy as np
 import pytest
+from browser import chromium, find_program
 
 from caryatid import cli
 from caryatid.config import Config, SensorConfig
@@ -31,13 +32,6 @@ from caryatid.sensing.views import Cloud
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import ground_truth, write_truth
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-"""What the program is called, in order of preference; the environment's CHROMIUM goes before."""
-BROWSER_ARGUMENTS = [
-    "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--disable-quic", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # The workers share the cores: threads that wait for one that is taken hold up every parallel loop.
@@ -151,16 +145,13 @@ def compiled() -> None:
 @pytest.fixture(scope="session")
 def browser():
     """Chromium, as playwright gives it."""
-    program = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
-    if program is None:
+    if find_program() is None:
         if os.environ.get("CI"):
             pytest.fail("there is no Chromium: `make chromium` installs it")
         pytest.skip("there is no Chromium")
-    playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=program, args=BROWSER_ARGUMENTS)
+    pytest.importorskip("playwright.sync_api")
+    with chromium() as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="session")

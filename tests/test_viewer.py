@@ -9,13 +9,12 @@ import urllib.error
 import urllib.request
 from dataclasses import replace
 from functools import partial
-from urllib.parse import urlparse
 
 import numpy as np
 import pytest
+from browser import Tab
 from conftest import SMALL, run_command
 from PIL import Image
-from scipy.spatial.transform import Rotation
 from shapely.geometry import MultiPoint, Point
 
 from caryatid import InputError, Scene
@@ -453,65 +452,21 @@ def test_a_scene_shows_itself_in_a_notebook_if_viser_is_there(views, monkeypatch
 # In a real browser: what a person would see and press, one thing after the other in one page
 
 
-class Tab:
-    """A page in Chromium, cut off from all but this machine; its errors, and the hosts it wanted to ask."""
+def picture(tab):
+    """The scene as pixels (H, W, 3): what the canvas shows, without the panels."""
+    tab.settle()
+    box = tab.page.locator("canvas").first.bounding_box()
+    shot = Image.open(io.BytesIO(tab.page.screenshot(clip=box)))
+    return np.asarray(shot.convert("RGB"), dtype=np.uint8)
 
-    def __init__(self, page):
-        self.page, self.errors, self.hosts = page, [], set()
-        page.set_default_timeout(60_000)  # Machines may be loaded [ms].
-        page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
-        page.on("pageerror", lambda error: self.errors.append(str(error)))
-        page.on("websocket", lambda socket: self.hosts.add(urlparse(socket.url).hostname))
-        page.route("**/*", self._asked)
 
-    def _asked(self, route):
-        address = urlparse(route.request.url)
-        if address.scheme not in ("blob", "data"):
-            self.hosts.add(address.hostname)
-            if address.hostname != "127.0.0.1":
-                route.abort()
-                return
-        route.continue_()
-
-    def open(self, url):
-        """Go to a viewer's page, at half resolution since it is drawn in software, and wait for its scene."""
-        self.page.goto(f"{url}?fixedDpr=0.5")
-        self.page.wait_for_selector("canvas")
-        self.wait_for_node("/shapes/o1")
-        self.page.locator("#webgl-software-rendering button").click()
-
-    def wait_for_node(self, name, there=True):
-        """Wait until the scene has, or has no longer, something of this name."""
-        test = f"({name!r} in (window.__viserSceneTree?.getState() ?? {{}})) === {str(there).lower()}"
-        self.page.wait_for_function(test)
-
-    def wait_until(self, true):
-        """Wait until something here is true."""
-        for _ in range(600):
-            if true():
-                return
-            self.page.wait_for_timeout(100)
-        pytest.fail("waited for a minute")
-
-    def wait_for_text(self, text):
-        """Wait until the page says something."""
-        self.page.get_by_text(text).first.wait_for()
-
-    def press(self, label):
-        """Press a button."""
-        self.page.get_by_role("button", name=label, exact=True).click()
-
-    def settle(self):
-        """Let two pictures be drawn."""
-        drawn = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
-        self.page.evaluate(drawn)
-
-    def picture(self):
-        """The scene as pixels (H, W, 3): what the canvas shows, without the panels."""
-        self.settle()
-        box = self.page.locator("canvas").first.bounding_box()
-        shot = Image.open(io.BytesIO(self.page.screenshot(clip=box)))
-        return np.asarray(shot.convert("RGB"), dtype=np.uint8)
+def wait_until(true, tab):
+    """Wait until something here is true."""
+    for _ in range(600):
+        if true():
+            return
+        tab.page.wait_for_timeout(100)
+    pytest.fail("waited for a minute")
 
 
 @pytest.fixture(scope="module")
@@ -526,24 +481,6 @@ def tab(page, browser):
     assert tab.hosts == {"127.0.0.1"}
 
 
-def pixel(page, point_world, tab):
-    """Where a point of the world is in the window [px]."""
-    tab.settle()
-    (client,) = page.server.get_clients().values()
-    rotation = Rotation.from_quat(client.camera.wxyz, scalar_first=True).as_matrix()
-    T_world_camera = transforms.rigid(rotation, client.camera.position)
-    x, y, z = transforms.transform(transforms.invert(T_world_camera), point_world[None])[0]
-    box = tab.page.locator("canvas").first.bounding_box()
-    focal = box["height"] / 2.0 / np.tan(client.camera.fov / 2.0)
-    middle = box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0
-    return float(middle[0] + focal * x / z), float(middle[1] + focal * y / z)
-
-
-def click(page, point_world, tab):
-    """Click where a point of the world is in the window."""
-    tab.page.mouse.click(*pixel(page, point_world, tab))
-
-
 @pytest.mark.slow
 def test_the_first_sight_is_the_objects_with_their_names_on_them(page, tab):
     page.wait()
@@ -552,11 +489,11 @@ def test_the_first_sight_is_the_objects_with_their_names_on_them(page, tab):
     box = tab.page.locator("canvas").first.bounding_box()
     corners = []
     for item in page.steps[-1].graph.objects[1:]:
-        u, v = map(round, pixel(page, page.drawing.anchors[item.id], tab))
+        u, v = map(round, tab.pixel(page, page.drawing.anchors[item.id]))
         around = shot[v - 11 : v + 11, u - 16 : u + 16]
         plate = np.abs(around - rgb(object_colour(item.label))).max(axis=-1) < 40
         assert plate.mean() > 0.1, item.id  # the rest is letters and blur
-        corners += [pixel(page, corner, tab) for corner in item.shape.outline()]
+        corners += [tab.pixel(page, corner) for corner in item.shape.outline()]
     low, high = np.min(corners, axis=0) - (box["x"], box["y"]), np.max(corners, axis=0) - (box["x"], box["y"])
     room = box["width"], box["height"]
     assert (low > 0.0).all()
@@ -567,7 +504,7 @@ def test_the_first_sight_is_the_objects_with_their_names_on_them(page, tab):
 @pytest.mark.slow
 def test_a_click_on_an_object_says_what_falls_without_it(page, tab):
     crate = page.steps[-1].graph["o1"]
-    click(page, crate.centre_world - (0.0, 0.0, crate.shape.extents[2] / 4.0), tab)
+    tab.click(page, crate.centre_world - (0.0, 0.0, crate.shape.extents[2] / 4.0))
     tab.wait_for_text("Without o1")
     tab.wait_for_text("falls with probability")
     assert "o2" in tab.page.locator(".caryatid-cell").last.inner_text()
@@ -578,19 +515,19 @@ def test_a_click_on_an_object_says_what_falls_without_it(page, tab):
 
 @pytest.mark.slow
 def test_the_page_shows_the_next_view_and_goes_back(page, tab):
-    first, number = tab.picture(), len(page.steps)
+    first, number = picture(tab), len(page.steps)
     assert len(np.unique(first.reshape(-1, 3), axis=0)) > 200
     tab.press("next view")
     tab.wait_for_text(f"View {number + 1} of {number + 1}")
     tab.wait_for_node(f"/cameras/{number + 1}")
-    second = tab.picture()
+    second = picture(tab)
     assert len(page.steps) == number + 1
     assert (np.abs(second.astype(int) - first).max(axis=-1) > 16).mean() > 0.01
 
     tab.page.get_by_role("slider").first.press("ArrowLeft")
     tab.wait_for_text(f"View {number} of {number + 1}")
     tab.wait_for_node(f"/cameras/{number + 1}", there=False)
-    assert (np.abs(tab.picture().astype(int) - second).max(axis=-1) > 16).mean() > 0.01
+    assert (np.abs(picture(tab).astype(int) - second).max(axis=-1) > 16).mean() > 0.01
     tab.page.get_by_role("slider").first.press("ArrowRight")
     tab.wait_for_node(f"/cameras/{number + 1}")
 
@@ -601,17 +538,17 @@ def test_a_view_is_chosen_by_hand(page, tab):
     tab.page.get_by_role("checkbox", name="choose the next view by hand").click()
     client = next(iter(page.server.get_clients().values()))
     centre, radius = step.sphere.centre_world, step.sphere.radius
-    tab.wait_until(lambda: np.linalg.norm(client.camera.position - centre) > 2.0 * radius)
+    wait_until(lambda: np.linalg.norm(client.camera.position - centre) > 2.0 * radius, tab)
     towards_eye = transforms.unit(client.camera.position - step.sphere.centre_world)
     facing = np.argmax(step.candidates.directions @ towards_eye)
     eye = step.sphere.centre_world + radius * step.candidates.directions[facing]
 
     def taken_next():
-        click(page, eye, tab)
+        tab.click(page, eye)
         tab.page.wait_for_timeout(500)
         return tab.page.get_by_text("next view chosen by hand").first.is_visible()
 
-    tab.wait_until(taken_next)  # A click before the page listens is lost.
+    wait_until(taken_next, tab)  # A click before the page listens is lost.
     tab.press("next view")
     tab.wait_for_node(f"/cameras/{number + 1}")
     taken = page.steps[number].view.T_world_camera
