@@ -26,7 +26,7 @@ from caryatid.graph import Support, SupportGraph
 from caryatid.io.graph_json import graph_text
 from caryatid.sources import open_source
 from caryatid.steps import read_run
-from caryatid.viewer.drawing import BY_HAND, EARLIER_POINTS, LAYERS, SPACING, reduced, visible_points
+from caryatid.viewer.drawing import BY_HAND, EARLIER_POINTS, LAYERS, LETTER, SPACING, reduced, visible_points
 from caryatid.viewer.loop import LoopPage, candidate_under
 from caryatid.viewer.page import Page, PageProcess, describe_object, describe_view
 from caryatid.viewer.robot import RobotDrawing, stations
@@ -142,6 +142,17 @@ def test_arrows_tell_direction_doubt_and_kind(page, step, drawn):
         assert nodes["/supports/probability 0"].text == f"{kind} 1.00"
 
 
+def test_arrows_begin_and_end_beside_names_however_far_behind_each_other(page, step, drawn):
+    drawn(with_supports(step, Support("o1", "o2")))
+    for eye in ((-1.0, -0.7, 1.3), (-0.1, 0.0, 2.0)):
+        page.drawing.face(transforms.look_at(eye, (0.0, 0.0, 0.8)))
+        arrow = page.drawing.nodes["supports"][0].points[0].astype(float)
+        names = [page.drawing.anchors[name] for name in ("o1", "o2")]
+        ways = [[transforms.unit(at - eye) for at in pair] for pair in (arrow, names)]
+        least = min(0.6 * LETTER, 0.25 * np.linalg.norm(ways[1][1] - ways[1][0]))
+        assert (np.linalg.norm(np.subtract(*ways), axis=1) > 0.9 * least).all()
+
+
 def test_names_are_on_what_can_be_seen_of_their_objects():
     """Seen from anywhere, a name is on its object's surface, inside its outline, and nothing is before it."""
     rng, found = np.random.default_rng(5), 0
@@ -204,7 +215,7 @@ def test_what_is_said_of_an_object(step, settings):
     assert "no object falls" in describe_object(graph, "o2", config)
     assert "Without" not in describe_object(graph, "o0", config)
     doubtful = with_supports(step, Support("o1", "o2", certain=False)).graph
-    said = "o1 → o2</dt><dd>bottom-up, probability 0.50, uncertain, 1 of 1"
+    said = "o1 → o2</dt><dd>bottom-up, probability 0.50, uncertain, 1 of 1 views"
     assert said in describe_object(doubtful, "o1", config)
     assert "not found" in describe_object(graph, "o9", config)
     assert "was removed" in describe_object(graph, "o9", config, taken=True)
@@ -322,9 +333,7 @@ def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(loop, monkeypatch
         loop.source = replace(loop.source, camera=None)
     loop._running.set()
     said = loop.clear()
-    assert said == "finished: " + (
-        "no objects are left; o1 removed; nothing disturbed" if simulated else "a safe order"
-    )
+    assert said == "finished: " + ("no objects are left; nothing disturbed" if simulated else "a safe order")
     rising = next(
         s for s in shown if s and s.graph["o2"].centre_world[2] > step.graph["o2"].centre_world[2] + 0.01
     )
@@ -535,7 +544,7 @@ def test_the_page_shows_the_next_view_and_goes_back(page, tab):
 @pytest.mark.slow
 def test_a_view_is_chosen_by_hand(page, tab):
     number, step = len(page.steps), page.steps[-1]
-    tab.page.get_by_role("checkbox", name="choose the next view by hand").click()
+    tab.page.get_by_role("checkbox", name="choose by hand").click()
     client = next(iter(page.server.get_clients().values()))
     centre, radius = step.sphere.centre_world, step.sphere.radius
     wait_until(lambda: np.linalg.norm(client.camera.position - centre) > 2.0 * radius, tab)
@@ -561,7 +570,7 @@ def test_a_view_is_chosen_by_hand(page, tab):
 def test_everything_is_taken_away(page, tab):
     page.describe("o2")
     tab.press("clear")
-    tab.wait_for_text("finished: no objects are left; o1 removed")
+    tab.wait_for_text("finished: no objects are left; nothing disturbed")
     tab.wait_for_node("/shapes/o1", there=False)
     tab.wait_for_node("/shapes/o2", there=False)
     tab.wait_for_text("was removed")

@@ -258,7 +258,7 @@ class Scene(Pictured):
         """Record what the robot did, and derive the graph again."""
         assert self.surface is not None
         assert self.voxels is not None
-        self._detector.history += (Change(kind, object_id, self.views, "reported"),)
+        self._detector.history += (Change(kind, object_id, self.views, "reported by the robot"),)
         newest = self._inferred(self.surface, self.voxels)
         names = {o.id: self._ids.get(o.label, o.id) for o in newest.objects if o.role == "object"}
         newest = renamed(newest, names)

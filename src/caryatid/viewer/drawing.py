@@ -266,7 +266,8 @@ class SceneDrawing:
             length = float(np.linalg.norm(along))
             if length < 1e-6:
                 continue
-            gap = min(0.6 * LETTER * size, 0.3 * length) / length  # Names stay readable.
+            across = float(np.linalg.norm(np.cross(along, end - eye_world))) / size  # As long as it looks.
+            gap = min(0.6 * LETTER * size / max(across, 1e-6), 0.3)  # Names stay readable.
             start, end, middle = start + gap * along, end - gap * along, (start + end) / 2.0
             colour, share = CERTAIN if support.certain else UNCERTAIN, max(support.belief, 0.3)
             neck = start

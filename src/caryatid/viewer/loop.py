@@ -170,7 +170,7 @@ class LoopPage(Page):
         explorer, config, camera = self._explorer, self._config, self.source.camera
         if not isinstance(camera, SimulatedCamera):
             return self._show_order(self.steps[-1], config)
-        hands, said = SimulatedHands(camera.scene, config), ""
+        hands, said, harmed = SimulatedHands(camera.scene, config), "", set[str]()
         film: list[Step] = []
         self.source = replace(self.source, truth=None)  # Ground truth is of the scene before any lift.
 
@@ -182,6 +182,7 @@ class LoopPage(Page):
             film.extend(_without(step, (), lift.object_id, T) for T in _moves(taken, hands.names, before))
             camera.scene = hands.scene
             said = f"{lift.object_id} removed; {', '.join(taken.disturbed) or 'nothing'} disturbed"
+            harmed.update(taken.disturbed)
             return taken.body is not None
 
         steps = clear(explorer, take, threads=cores())
@@ -189,7 +190,7 @@ class LoopPage(Page):
             with self.working:
                 step = next(steps, None)
             if step is None:
-                return f"finished: {self.ended}; {said}"
+                return f"finished: {self.ended}; {', '.join(sorted(harmed)) or 'nothing'} disturbed"
             self._show(film)
             film.clear()
             self.stage(None)
@@ -245,7 +246,7 @@ class LoopPage(Page):
                 "fusion", get_args(FusionMethod), initial_value=self._config.fusion.method
             )
             hint = "Click the view sphere to choose the next view"
-            by_hand = gui.add_checkbox("choose the next view by hand", False, hint=hint)
+            by_hand = gui.add_checkbox("choose by hand", False, hint=hint)
             hint = "Remove all objects: look until a lift is safe, remove the object, look again"
             self._clear = gui.add_button("clear", hint=hint)
         self._choices = planner, fusion

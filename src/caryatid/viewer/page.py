@@ -253,7 +253,8 @@ class Page:
         graph = step.graph
         if graph is not self._graph_drawn:
             self._graph_drawn = graph
-            self._graph.content = cell_html(Section("", figures=[Figure("", draw_graph(graph))]))
+            picture = draw_graph(graph, compact=True)
+            self._graph.content = cell_html(Section("", figures=[Figure("", picture)]))
         if scores != self._charted and any(f1 is not None for f1 in scores):
             self._charted = scores
             chart = draw_chart(
@@ -327,7 +328,7 @@ def describe_object(
     facts = []
     for supporter, supported, kind, likely, found, why in support_table(graph).rows:
         if object_id in (supporter.text, supported.text):
-            evidence = f"{kind.text}, probability {likely.text}, {found.text}; {why.text}"
+            evidence = f"{kind.text}, probability {likely.text}, {found.text} views; {why.text}"
             facts.append((f"{supporter.text} → {supported.text}", evidence))
     if item.role == "object":
         effects = predict_removal(graph, object_id, config)

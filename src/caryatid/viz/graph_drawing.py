@@ -110,7 +110,11 @@ PITCH, NODE = np.array([78.0, -110.0]), np.array([56.0, 40.0])
 
 
 def draw_graph(
-    graph: SupportGraph, wrong: Collection[Sequence[str]] = (), missing: Collection[Sequence[str]] = ()
+    graph: SupportGraph,
+    wrong: Collection[Sequence[str]] = (),
+    missing: Collection[Sequence[str]] = (),
+    *,
+    compact: bool = False,
 ) -> Picture:
     """Draw the support graph: the table below, what it carries above it, doubt in dashes.
 
@@ -122,21 +126,23 @@ def draw_graph(
         graph: What to draw.
         wrong: Pairs of ids of its supports that the ground truth does not have; they are marked.
         missing: Pairs of ids of supports that it lacks; those between its objects are drawn too.
+        compact: Draw it for a narrow panel, whose letters would otherwise be small.
     """
+    pitch, least = (PITCH * (1.0, 0.75), 420.0) if compact else (PITCH, 560.0)
     ids, known = {o.id for o in graph.objects}, {s.pair for s in graph.supports}
     lacking = [Support(a, b, probability=0.0) for a, b in missing if {a, b} <= ids and (a, b) not in known]
     graph = replace(graph, supports=(*graph.supports, *lacking))
     marks = dict.fromkeys(map(tuple, wrong), "wrong ") | dict.fromkeys([s.pair for s in lacking], "missing")
     places, routes = arrange(graph)
     passed = [*places.values(), *chain.from_iterable(routes.values()), (0.0, 0.0)]
-    span, tall = np.max(passed, axis=0) * PITCH * (1.0, -1.0) + (92.0, 76.0)
-    width = max(span, 560.0)  # In less space the letters of small graphs grow too large.
-    height = max(tall, 0.73 * min(width, 560.0))
+    span, tall = np.max(passed, axis=0) * pitch * (1.0, -1.0) + (92.0, 76.0)
+    width = max(span, least)  # In less space the letters of small graphs grow too large.
+    height = max(tall, 0.73 * min(width, least))
     corner = np.array([(width - span) / 2.0 + 46.0, (height + tall) / 2.0 - 30.0])
     table = None if graph.support_surface is None else graph.support_surface.id
     edges, notes, words = [], [], []
     for support in graph.supports:
-        points = corner + PITCH * routes[support.pair]
+        points = corner + pitch * routes[support.pair]
         if support.pair[::-1] in routes:
             points[:, 0] += 8.0 * np.sign(points[0, 1] - points[-1, 1])  # Beside the edge that leads back.
         edges.append(_from_rim_to_rim(points, support, table))
@@ -151,7 +157,7 @@ def draw_graph(
         for support, points, word, place in zip(graph.supports, edges, words, plates_at, strict=True):
             _put_edge(axes, support, points, word, place, marked=support.pair in marks)
         for item in graph.objects:
-            at, half = corner + PITCH * places[item.id], NODE / 2.0
+            at, half = corner + pitch * places[item.id], NODE / 2.0
             if item.id == table:
                 at, half = np.array([width / 2.0, at[1] - 6.0]), np.array([width / 2.0 - 12.0, 14.0])
             _put_node(axes, item, at, half, graph)
