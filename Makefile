@@ -74,6 +74,7 @@ docs: $(VENV)/.docs
 
 pictures: install
 	$(BIN)/python docs/pictures/draw.py concepts
+	$(BIN)/python docs/pictures/draw.py viewer
 
 gif: install
 	$(BIN)/python docs/pictures/draw.py film

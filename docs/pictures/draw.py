@@ -1,17 +1,22 @@
-"""The documentation's pictures: each stage of the loop on one scene, and the film of README.md.
+"""The documentation's pictures: each stage of the loop on one scene, the film of README.md, and the viewer.
 
     python docs/pictures/draw.py concepts
     python docs/pictures/draw.py film
+    python docs/pictures/draw.py viewer
 
-The same command draws the same pictures, byte for byte, with the drawings of reports (`caryatid.viz`).
+The same command draws the same pictures; the first two byte for byte, with the drawings of reports
+(`caryatid.viz`), the last one in Chromium.
 """
 
 from __future__ import annotations
 
 import io
+import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -37,6 +42,8 @@ from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth
 from caryatid.simulation.world import box, build_spec, cylinder, scene_from_spec, sphere
+from caryatid.sources import open_source
+from caryatid.viewer.loop import LoopPage
 from caryatid.viz.drawings import Projection, draw_cloud, draw_image, draw_sphere
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.pictures import Picture, own_style
@@ -213,8 +220,50 @@ def film() -> tuple[list[Image.Image], list[int]]:
     return [ImageOps.pad(image, size, color="white", centering=(0, 0)) for image in images], times
 
 
-def main(what: Annotated[Literal["concepts", "film"], tyro.conf.Positional]) -> None:
-    """Draw the pictures of docs/concepts.md or the film of README.md."""
+@contextmanager
+def viewing(browser: Any, source: str, **options: Any) -> Iterator[tuple[LoopPage, Any]]:
+    """A viewer's page after its first view, and the tab of Chromium that shows it."""
+    from browser import Tab
+
+    opening = partial(open_source, source, noise="carmine", segmentation=None, seed=0)
+    with closing(LoopPage(opening, Config(), **options)) as page:
+        page.start()
+        page.wait()
+        tab = Tab(browser.new_page(viewport={"width": 1280, "height": 720}))
+        tab.open(page.url, resolution=1.0)
+        yield page, tab
+
+
+def viewer() -> Iterator[tuple[str, Image.Image]]:
+    """What the viewer shows of a scene and of a recording."""
+    sys.path.insert(0, str(PICTURES.parents[1] / "tests"))
+    from browser import chromium
+
+    def shot(tab: Any) -> Image.Image:
+        tab.page.wait_for_timeout(2000)  # Text is laid out, then pictures are decoded.
+        tab.settle()
+        return Image.open(io.BytesIO(tab.page.screenshot())).convert("RGB")
+
+    with chromium() as browser:
+        with viewing(browser, "clutter") as (page, tab):
+            yield "first", shot(tab)
+            for number in (2, 3):
+                tab.press("next view")
+                tab.wait_for_text(f"View {number} of {number}")
+            yield "views", shot(tab)
+            tab.click(page, page.drawing.anchors["o6"])
+            tab.wait_for_text("Without o6")
+            yield "object", shot(tab)
+            tab.press("clear")
+            page.wait()
+            tab.wait_for_text("finished")
+            yield "cleared", shot(tab)
+        with viewing(browser, "sample-recording", segmentation="auto") as (_, tab):
+            yield "recording", shot(tab)
+
+
+def main(what: Annotated[Literal["concepts", "film", "viewer"], tyro.conf.Positional]) -> None:
+    """Draw the pictures of docs/concepts.md, the film of README.md, or the viewer of docs/runs.md."""
     known: dict[str, Any] = {"method": Image.Quantize.MEDIANCUT, "dither": Image.Dither.NONE}
     if what == "film":
         images, times = film()
@@ -222,8 +271,10 @@ def main(what: Annotated[Literal["concepts", "film"], tyro.conf.Positional]) -> 
         file = PICTURES / "explore.gif"
         first.save(file, save_all=True, append_images=others, duration=times, loop=0, optimize=False)
         return
-    for name, image in concepts().items():
-        image.quantize(256, **known).save(PICTURES / "concepts" / f"{name}.png", optimize=True)
+    pictures = viewer() if what == "viewer" else concepts().items()
+    for name, image in pictures:
+        file = f"viewer-{name}.png" if what == "viewer" else f"concepts/{name}.png"
+        image.quantize(256, **known).save(PICTURES / file, optimize=True)
 
 
 if __name__ == "__main__":
