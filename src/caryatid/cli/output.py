@@ -83,7 +83,8 @@ class Output(logging.Handler):
         f1 = "" if score is None else f", F1 {score.f1:.3f}"
         self.say(f"view {step.index + 1}: {census(step.graph)}{f1} ({turn(step.timings):.1f} s)")
         for line in changes(before, step.graph):
-            self.say(f"  {line}")
+            kind, _, items = line.partition(": ")
+            self.say(f"  {kind}: " + items.replace(", ", "\n" + " " * (len(kind) + 4)))
         if step.lift is not None:
             self.say(f"  removed {step.lift.object_id}: {step.lift.why}")
         if step.decision is not None:

@@ -61,7 +61,7 @@ class RunCommand(options.ComputingCommand):
         with RunWriter(self.out, config, _about(self)) as writer:
             name, truth, steps = self.open(config)
             writer.more["conditions"] = conditions = _conditions(self)
-            graph = _record(writer, steps, truth, output, f"{name}: {conditions}", page).graph
+            graph = _record(writer, steps, truth, output, f"{name} ({conditions})", page).graph
         if not self.no_report:
             _draw_report(self.out, output)
         output.say(f"{name}: {census(graph)} after {count_of(len(writer.steps), 'view')}")
@@ -97,8 +97,7 @@ class Explore(RunCommand, options.ExploringCommand):
     no_early_stop: options.Flag = False
     """Continue to the maximum number of views, even if no view is worth its path."""
     goal: Annotated[str | None, options.shown("ID")] = None
-    """Object to remove: explore only what matters for its removal, and stop when it is clear what else
-    would move."""
+    """Object to remove: explore only what matters for it, and stop when it is clear what else would move."""
     until: Annotated[float | None, options.shown("P", "0.95 with --goal, else never")] = None
     """Stop when every support (with --goal, every effect of the removal) is known with this probability."""
     view: options.Flag = False
@@ -162,8 +161,7 @@ class View(options.ExploringCommand):
     source: options.SourceName
     """Run, scene or recording."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen on; with any other than 127.0.0.1, other machines can open the page if they know its
-    full address."""
+    """Address to listen on; with any but 127.0.0.1, other machines can open the page by its full address."""
     port: options.Port = PORT
     """Port to listen on; if taken, the next free one; 0 = any free port."""
     no_browser: options.Flag = False
@@ -332,7 +330,7 @@ class Clear(options.ExploringCommand):
             known = {"goal": self.goal, "hands": self.hands, "threads": cores()}
             steps = clear(explorer, take, past=() if past is None else read_steps(past), **known)
             writer.more["conditions"] = conditions = _conditions(self)
-            last = _record(writer, steps, None, output, f"{source.name}: {conditions}")
+            last = _record(writer, steps, None, output, f"{source.name} ({conditions})")
         if not self.no_report:
             _draw_report(self.out, output)
         harmed = sorted({body for lift in lifts for body in lift["disturbed"]})
@@ -341,7 +339,7 @@ class Clear(options.ExploringCommand):
         document = {"run": str(self.out), "success": reached and not harmed, "stop": last.stop}
         document |= {"views": last.index + 1, "steps": taken, "left": hands.left, "warnings": output.warnings}
         rows = [
-            (str(number), lift["object"], lift["body"] or "nothing there", ", ".join(lift["held"]),
+            (str(number), lift["object"], lift["body"] or "nothing there", ", ".join(lift["held"]) or "–",
              ", ".join(lift["disturbed"]) or "–", lift["why"])
             for number, lift in enumerate(lifts, start=1)
         ]  # fmt: skip
