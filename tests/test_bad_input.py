@@ -237,7 +237,7 @@ def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
     strange = shutil.copytree(scene_file.parent, tmp_path / "strange")
     (strange / "gt.json").write_text('{"vertices": ["table", "ghost"], "edges": []}')
     for scored, truth, says in (
-        (tmp_path / "nowhere", scene_file.parent, "not a directory"),
+        (tmp_path / "nowhere", scene_file.parent, "no such folder"),
         (run, tmp_path / "nowhere", "no such scene or recording"),
         (recording, scene_file.parent, "run.json: the file is missing"),
         (run, recording, "gt.json: the file is missing"),

@@ -185,6 +185,11 @@ def test_scenes_and_samples_are_listed_and_a_name_spelt_wrong_is_guessed(tmp_pat
     assert "did you mean tower?" in capsys.readouterr().err
 
 
+def test_without_a_command_it_shows_how_to_start(capsys):
+    assert run_command() == 0
+    assert "caryatid demo" in capsys.readouterr().out
+
+
 def test_a_run_is_scored_against_its_scene(kept_run, scene_file, capsys):
     assert run_command("evaluate", kept_run, scene_file.parent, "--json") == 0
     views = json.loads(capsys.readouterr().out)["views"]
@@ -212,11 +217,12 @@ def test_the_demo_says_view_by_view_what_it_found(tmp_path, capsys):
     said = capsys.readouterr()
     conditions, *lines = said.err.splitlines()
     assert said.out == ""
-    assert conditions == "tower: masks: simulator, noise: carmine"
+    assert conditions == "tower (masks: simulator, noise: carmine)"
     assert re.fullmatch(r"view 1: \d objects, \d supports.*, F1 \d\.\d{3} \(\d+\.\d s\)", lines[0])
     assert lines[1].startswith("  found: o1 (")
     assert " supported by " in lines[1]
-    assert lines[2].startswith("  next view: ")
+    assert lines[2].startswith("         o2 (")
+    assert any(line.startswith("  next view: ") for line in lines)
     assert any(line.startswith("view 2: ") for line in lines)
     assert "  done: maximum of 2 views reached" in lines
     assert str(tmp_path / "run") in lines[-1]

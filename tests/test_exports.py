@@ -241,7 +241,7 @@ def test_a_file_that_is_no_export_is_never_touched(tmp_path, kept_run, monkeypat
 
 def test_what_cannot_be_exported_is_said(tmp_path, graph, capsys):
     assert run_command("export", tmp_path / "no-run", "--out", tmp_path / "s.xml") == 1
-    assert "not a directory" in capsys.readouterr().err
+    assert "no such folder" in capsys.readouterr().err
     assert run_command("export", tmp_path, "--format", "step", "--out", tmp_path / "s.step") == 2
     with pytest.raises(InputError, match="has no objects"):
         export_graph(SupportGraph(), tmp_path / "s.glb")

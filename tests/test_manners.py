@@ -99,7 +99,6 @@ def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, 
         ("juggle", "juggle"),
         ("expore tower", "Did you mean explore?"),
         ("explore tower --planner suport", "Did you mean support?"),
-        ("", "explore"),
     ],
 )
 def test_a_usage_error_says_what_would_do_and_is_no_wall_of_text(words, said, capsys, monkeypatch):

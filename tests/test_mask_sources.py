@@ -121,7 +121,7 @@ def test_what_gives_no_masks_is_refused(tmp_path, channels, capsys):
     view = simulated_views("tower")[0]
     with pytest.raises(InputError, match="has no colour image"):
         mask_source(channels, Config())(replace(view, rgb=None))
-    with pytest.raises(InputError, match="not a directory"):
+    with pytest.raises(InputError, match="no such folder"):
         mask_source(str(tmp_path / "nowhere"), Config())
     with pytest.raises(InputError, match="has no masks for"):
         mask_source(str(tmp_path), Config())(view)

@@ -228,7 +228,7 @@ def read_run(folder: str | Path) -> Run:
     """
     folder, remedy = Path(folder), "give a run folder, as written by explore, extract or clear"
     if not folder.is_dir():
-        raise InputError(folder, "not a directory", remedy)
+        raise InputError(folder, "no such folder", remedy)
     path = folder / "run.json"
     record = read_json(path, remedy)
     count = parse_json(_RunFile, record, path, AGAIN).views

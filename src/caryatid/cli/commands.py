@@ -75,12 +75,12 @@ def read_command(arguments: Sequence[str]) -> Any:
     """
     shown = sys.stdout.isatty() and sys.stderr.isatty() and not os.environ.get("NO_COLOR")
     tyro._experimental_options["ansi_codes"] = shown
-    name, *options = [*arguments] or [""]
+    name, *options = arguments = [*arguments] or ["--help"]
     try:
         if name in COMMANDS:
             return tyro.cli(find_command(name), prog=f"caryatid {name}", args=options, config=MARKERS)
         return tyro.cli(
-            _any_command(), prog="caryatid", description=DESCRIPTION, args=list(arguments), config=MARKERS
+            _any_command(), prog="caryatid", description=DESCRIPTION, args=arguments, config=MARKERS
         )
     except SystemExit as end:
         if end.code:

@@ -131,8 +131,7 @@ class Modelling(Settings):
     masks: Annotated[
         str | None, tyro.conf.arg(metavar="{scene,per-view,onnx:FILE,FOLDER}"), default_of("fusion.masks")
     ] = None
-    """What a mask's number identifies: an object in all views (scene) or a segment of one view (per-view). Or
-    where masks come from: an ONNX model, or a folder with a NAME.png or NAME.npy per view."""
+    """Masks number objects (scene) or segments of one view (per-view), or come from a model or folder."""
     seed: Annotated[int, whole_number(0)] = 0
     """Random seed; the same seed gives the same graph, byte for byte."""
 
@@ -200,8 +199,7 @@ class LookingCommand(ComputingCommand):
     ] = None
     """Use the given masks or labels, or segment automatically."""
     ignore: Annotated[Path | None, shown("MASK.png")] = None
-    """Mask of pixels to ignore in every view, such as the robot's arm: a grey PNG, 0 = keep. For a recording,
-    also a folder with one NAME.png per view."""
+    """Pixels to ignore, such as the robot's arm: a grey PNG, 0 = keep; or a folder of NAME.png by view."""
 
     def mask_source(self, config: Config) -> MaskSource | None:
         """The source of masks, or None.

@@ -46,8 +46,7 @@ class Import(options.Command):
     camera: Annotated[Path | None, options.shown("FILE.json")] = None
     """Intrinsics of a TUM RGB-D folder: fx, fy, cx, cy [px]. If omitted, the published values."""
     level: options.Flag = False
-    """Rotate the world frame so that the table is level; use it if z does not point up. Most views must show
-    the table."""
+    """Rotate the world frame so that z points up from the table, which most views must show."""
     views: Annotated[options.OptionalCount, options.default_of("recording.max_views")] = None
     """Maximum number of views."""
 

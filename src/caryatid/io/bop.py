@@ -76,7 +76,7 @@ def read_recording(folder: str | Path, config: RecordingConfig | None = None) ->
     check_type("folder", folder, (str, Path), "give a scene folder in the BOP format")
     folder = find_sample(folder)
     if not folder.is_dir():
-        raise InputError(folder, "not a directory", "give a scene folder in the BOP format")
+        raise InputError(folder, "no such folder", "give a scene folder in the BOP format")
     path = folder / "scene_camera.json"
     remedy = "a recording needs it: cam_K and depth_scale of each frame"
     cameras = parse_json(dict[int, _Camera], read_json(path, remedy), path, remedy)

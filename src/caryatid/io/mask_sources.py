@@ -37,7 +37,7 @@ def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
         return OnnxMasks(Path(name.removeprefix(ONNX)), config, seed)
     folder = Path(name)
     if not folder.is_dir():
-        raise InputError(name, "not a directory", "give a folder of masks, or onnx:FILE")
+        raise InputError(name, "no such folder", "give a folder of masks, or onnx:FILE")
     return partial(with_stored_masks, folder, max_pixels=config.recording.max_pixels)
 
 
