@@ -406,6 +406,14 @@ def test_view_says_in_one_line_what_cannot_be_shown(source, monkeypatch, capsys)
     assert capsys.readouterr().err.startswith("error: ")
 
 
+@pytest.mark.parametrize(("option", "value"), [("--host", "192.0.2.1"), ("--port", 99999)])
+def test_view_says_in_one_line_where_it_cannot_listen(kept_run, option, value, capsys):
+    assert run_command("view", kept_run, "--no-browser", option, value) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert str(value) in line
+
+
 @pytest.mark.slow
 def test_explore_shows_its_views_while_it_works(scene_file, tmp_path, monkeypatch, capsys):
     pages = []

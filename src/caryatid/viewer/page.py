@@ -7,6 +7,7 @@ import logging
 import os
 import secrets
 import signal
+import socket
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -408,6 +409,15 @@ def _serve(title: str, host: str, port: int, token: str) -> Any:
     with needs_extra("view", "viewer"):
         import viser
         from websockets.asyncio import server as sockets
+
+    # viser would wait forever for a server that cannot start.
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        socket.create_server((host, 0), family=family).close()
+    except OSError:
+        raise InputError(host, "is not an address of this machine", "choose another --host") from None
+    if not 0 <= port < 2**16:
+        raise InputError(f"port {port}", "is out of range", "choose 0 to 65535")
 
     class Server(viser.ViserServer):
         """A server whose page stays on this machine: nobody can ask for a public address."""
