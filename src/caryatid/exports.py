@@ -41,7 +41,7 @@ def format_of(path: Path, wanted: ExportFormat | None = None) -> ExportFormat:
     if found is None or wanted not in (None, found):
         endings = [ending for ending, format_ in ENDINGS.items() if wanted in (None, format_)]
         reason = f"the suffix is not that of {wanted or 'any format'}"
-        raise InputError(path, reason, f"use {' or '.join(endings)}")
+        raise InputError(path, reason, f"use {', '.join(endings)}")
     return found
 
 
