@@ -181,7 +181,8 @@ def test_it_names_each_object_edge_figure_and_setting(report, html):
     for said in (
         "View 1", "View 2", "0.900", "F1 over views", "Found so far", "How it went", "no change",
         "Sees o2 & o7 best", "The graph did not change", "12 too low", "Removal", "image_width=160",
-        "masks: simulator · caryatid <1>", "3 objects, 4 supports, 2 of them uncertain after 2 views",
+        "masks: simulator · caryatid <1>",
+        "1 object removed. 3 objects, 4 supports, 2 of them uncertain after 2 views",
         "Wrong supports: o0 → o2; missing supports: o1 → o7, o0 → lid; wrong objects: o7; "
         "missing objects: lid", "wrong 0.50", "missing",
         "160 × 180 × 100", "Run <script>alert(1)</script>", "a<b>.xml", "view <7> & more",

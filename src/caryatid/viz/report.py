@@ -167,7 +167,8 @@ def make_report(
         raise ValueError("a report needs at least one view")
     if scores and len(scores) != len(seen):
         raise ValueError(f"{len(scores)} scores for {len(seen)} views")
-    sections = [*_answer(last, shown, len(seen), scores[-1] if scores else None, width)]
+    removed = f"{count_of(len(strip), 'object')} removed. " if strip else ""
+    sections = [*_answer(last, shown, len(seen), scores[-1] if scores else None, width, removed)]
     facts = [(f"Before view {step.index + 1}", _in_words(change)) for step in seen for change in step.changes]
     facts += [("Finished", sentence(last.stop))] if last.stop else []
     pictures = [*contacts * (len(contacts) > 1), *_charts(seen, scores)]
@@ -189,11 +190,11 @@ def _in_words(change: Change) -> str:
 
 
 def _answer(
-    step: Step, shown: Step, views: int, score: Mapping[str, Any] | None, width: int
+    step: Step, shown: Step, views: int, score: Mapping[str, Any] | None, width: int, before: str
 ) -> Iterator[Section]:
     """The final graph beside the view of the step that shows most objects, in 3D, and what is uncertain."""
     graph, truth, facts = step.graph, score or {}, []
-    text = f"{census(graph)} after {count_of(views, 'view')}."
+    text = f"{before}{census(graph)} after {count_of(views, 'view')}."
     if score is not None:
         text += f" F1 {truth['f1']:.3f}, precision {truth['precision']:.3f}, recall {truth['recall']:.3f}."
     if "wrong" in truth:
