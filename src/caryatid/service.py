@@ -41,7 +41,7 @@ from caryatid.io.images import read_mask
 from caryatid.io.json_files import Numbers
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.captures import CameraRecord
-from caryatid.sessions.next_view import Reachable
+from caryatid.sessions.next_view import CandidateViews
 from caryatid.sessions.session import Added, SessionConflictError
 
 
@@ -409,7 +409,7 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
 
     @app.post("/sessions/{name}/next", response_model=NextAnswer)
     @queued
-    def choose_next_view(name: SessionName, given: Reachable) -> Any:
+    def choose_next_view(name: SessionName, given: CandidateViews) -> Any:
         """Plan the next best view among poses that your robot can reach."""
         return pool.session(name).next(given.T_world_camera, given.path_length).to_json()
 

@@ -129,13 +129,13 @@ class Next(SessionStep):
     def __call__(self) -> None:
         from caryatid.io.json_files import parse_json, read_json
         from caryatid.sessions import Session
-        from caryatid.sessions.next_view import Reachable
+        from caryatid.sessions.next_view import CandidateViews
 
         with Session.open(self.folder, read_only=True) as session:
             if self.candidates is None:
                 view = session.next()
             else:
-                given = parse_json(Reachable, read_json(self.candidates), self.candidates)
+                given = parse_json(CandidateViews, read_json(self.candidates), self.candidates)
                 view = session.next(given.T_world_camera, given.path_length)
         self.output.result(view.to_json())
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from caryatid.exploration import Explorer, Step, used_up
 from caryatid.graph import TakeStep
-from caryatid.manipulation.grasps import Reachable
 from caryatid.manipulation.order import plan_order
+from caryatid.robots.arm import Reachable
 
 MISSES = 2
 """Number of lifts in a row that remove nothing after which clearing stops [1]: the model is then wrong."""

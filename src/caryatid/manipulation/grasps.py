@@ -8,21 +8,19 @@ both ways, and approach through space that was seen empty.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from caryatid.config import GripperConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Grasp
+from caryatid.robots.arm import Reachable
 from caryatid.sensing.voxel_map import FREE, VoxelMap
 
-Reachable = Callable[[Array], NDArray[np.bool_]]
-"""Function that tests which gripper poses the arm reaches: `T_world_gripper` (N, 4, 4) → (N,)."""
 POINTS = 200
 """Number of surface points at which grasps are tried [1]: 8 mm apart on a cube of 5 cm."""
 TURNS = np.radians([0.0, 30.0, -30.0, 60.0, -60.0, 90.0, -90.0])

@@ -30,7 +30,8 @@ from caryatid.errors import InputError
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Grasp, SceneObject, SupportGraph, TakeStep
-from caryatid.manipulation.grasps import Blocked, Reachable, find_grasp
+from caryatid.manipulation.grasps import Blocked, find_grasp
+from caryatid.robots.arm import Reachable
 from caryatid.runtime.display import Pictured
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.simulation.lifting import ASIDE, Lift, Lifting

@@ -27,7 +27,7 @@ from caryatid.robots.protocol import (
 from caryatid.sensing.view_sphere import ViewSphere
 
 Reachable = Callable[[Array], NDArray[np.bool_]]
-"""Function that tests which camera poses are reachable: `T_base_camera` (N, 4, 4) → (N,)."""
+"""Function that tests which poses (N, 4, 4) of its camera or gripper an arm reaches: → (N,)."""
 
 REASONS = (
     "the camera would be too low over the table",

@@ -54,7 +54,7 @@ class NextView:
 
 
 @dataclass(frozen=True, eq=False)
-class Reachable:
+class CandidateViews:
     """Candidate views that a robot can reach: candidates.json.
 
     Attributes:
