@@ -373,6 +373,13 @@ class TestCommands:
             assert all(0.0 <= step["grasp"]["seen_free"] < 0.95 for step in document["steps"])
             assert ("was not seen empty" in document["stop"]) == (not taken)
 
+    def test_it_looks_on_while_no_lift_is_safe(self, scene_file, tmp_path, capsys):
+        command = ["clear", scene_file, "--views", 6, "--set=active.effort=1", "--out", tmp_path / "run", "--json"]
+        assert run_command(*command, "--no-report", *SMALL, "--risk=0", QUICK[0], QUICK[2]) == 0
+        document = json.loads(capsys.readouterr().out)
+        assert (document["views"], document["steps"]) == (6, [])
+        assert document["stop"].startswith("no lift is safe")
+
     def test_a_recording_cannot_be_cleared(self, recording, capsys, leftovers):
         assert run_command("clear", recording, *QUICK, "--quiet") == 1
         assert "cannot be simulated" in capsys.readouterr().err
