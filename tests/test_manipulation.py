@@ -374,8 +374,8 @@ class TestCommands:
             assert ("was not seen empty" in document["stop"]) == (not taken)
 
     def test_it_looks_on_while_no_lift_is_safe(self, scene_file, tmp_path, capsys):
-        command = ["clear", scene_file, "--views", 6, "--set=active.effort=1", "--out", tmp_path / "run", "--json"]
-        assert run_command(*command, "--no-report", *SMALL, "--risk=0", QUICK[0], QUICK[2]) == 0
+        command = ["clear", scene_file, "--views", 6, "--set=active.effort=1", "--json", "--no-report"]
+        assert run_command(*command, "--out", tmp_path / "run", *SMALL, "--risk=0", QUICK[0], QUICK[2]) == 0
         document = json.loads(capsys.readouterr().out)
         assert (document["views"], document["steps"]) == (6, [])
         assert document["stop"].startswith("no lift is safe")
