@@ -10,7 +10,9 @@ from synthetic import box, config_for, edges, look_from, model_of, simulated_sce
 
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
+from caryatid.objects.changes import appeared
 from caryatid.scene import Scene
+from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.world import posed, poses_of
 
@@ -73,6 +75,15 @@ def test_what_somebody_put_down_is_new(segmentation, state):
     scene.update(*views_of(state, [200.0]))
     assert [change.kind for change in scene.changes] == ["added"]
     assert scene.graph[scene.changes[0].object_id].shape.kind == "sphere"
+
+
+@pytest.mark.parametrize(("rest", "new"), [(UNKNOWN, True), (OCCUPIED, False)])
+def test_unknown_space_does_not_say_what_is_new(rest, new):
+    """Of 40 points 2 cm apart, ten are in free space."""
+    points = np.stack([0.01 + 0.02 * np.arange(40), np.zeros(40), np.zeros(40)], axis=1)
+    states = np.full((40, 7), rest, dtype=np.int8)
+    states[:10] = FREE
+    assert bool(appeared("view", points, np.ones(40, dtype=np.int32), states)) == new
 
 
 def test_a_pose_is_not_to_blame_for_a_change_that_is_noticed(state, caplog):

@@ -66,7 +66,7 @@ def run_on_cluster(
 ) -> Outcomes:
     """Run episodes on the workers of a scheduler, which must answer within `patience` [s].
 
-    Yields each with its outcome as soon as it is done; tells if there are no workers.
+    Yields each with its outcome as soon as it is done; calls `tell` if there are no workers.
 
     Raises:
         InputError: No scheduler answers.

@@ -35,7 +35,7 @@ def default_of(setting: str, metavar: str | None = None) -> object:
 
 
 def one_of(choice: Any) -> PrimitiveConstructorSpec[Any]:
-    """One of a few words (or of a Literal), or None if omitted; all else is a usage error that lists them."""
+    """One of a few words (or of a Literal), or None if omitted; anything else is a usage error."""
     words: tuple[str, ...] = get_args(choice) or choice
     return _word("{" + ",".join(words) + "}", str, words)
 
@@ -131,7 +131,7 @@ class Modelling(Settings):
     masks: Annotated[
         str | None, tyro.conf.arg(metavar="{scene,per-view,onnx:FILE,FOLDER}"), default_of("fusion.masks")
     ] = None
-    """Masks number objects (scene) or segments of one view (per-view), or come from a model or folder."""
+    """What mask numbers identify: objects (scene) or segments of a view (per-view). Or a model or folder."""
     seed: Annotated[int, whole_number(0)] = 0
     """Random seed; the same seed gives the same graph, byte for byte."""
 

@@ -113,7 +113,7 @@ def candidates(
 ) -> list[Fit]:
     """Return the best fit of each shape that could be fitted, lowest cost first; none if points are few.
 
-    The arguments are as in `fit`; `whole` says whether bare parts of sides that should have been seen cost.
+    Arguments are as in `fit`. With `whole`, sides that should have been seen cost by their bare share.
     """
     fits, judged_by = _ranked(*_finite(points, normals), config, rng)
     return sorted((_with_bare(f, judged_by) for f in fits), key=lambda f: f.cost) if whole else fits

@@ -164,7 +164,7 @@ class Solid(Shape):
         return np.asarray(reach >= reach.max() - depth)
 
     def lengthened(self, direction: Array, depth: float, length: float) -> Solid:
-        """The solid with the corners within a depth [m] of its end moved by a length [m], back if negative.
+        """Move the corners within a depth [m] of the solid's end by a length [m]; a negative one shortens it.
 
         The end and the move are along a unit vector (3,) in the solid's frame.
         """

@@ -29,7 +29,7 @@ def clear(
 
     A lift is safe if no other object moves with a probability above `config.rehearsal.risk`, as in
     `plan_order`; with a gripper, it also needs a grasp. It is carried out when no view of what it depends on
-    is worth its path. As long as no lift is safe, the robot looks on; both end after
+    is worth its path. While no lift is safe, the robot keeps looking. Both end after
     `config.active.max_views` views since the previous lift. After each lift the robot looks again, and so
     detects objects that slid or fell.
 
@@ -90,18 +90,17 @@ def _lift(
             scene.graph, scene.config, steps=1, voxels=scene.voxels, reachable=reachable, **known
         )
         lift, missing = next(iter(order.steps), None), order.refusal
-    safe = lift is not None and lift.safe
-    explorer.goal = lift.object_id if lift is not None and safe else None
-    explorer.plan()
-    assert explorer.step is not None
-    # Where no lift is safe, a view that shows little is worth its path too.
-    enough = explorer.reason_to_stop() if safe or not found else explorer.step.stop
+    safe = lift if lift is not None and lift.safe else None
+    explorer.goal = None if safe is None else safe.object_id
+    step = explorer.plan()
+    # While no lift is safe, a view that shows little is worth its path too.
+    enough = explorer.reason_to_stop() if safe or not found else step.stop
     reason = used_up(views, scene.config.active) or enough
     if reason is None:
         return None, None
-    if lift is None:
-        return None, f"{reason}; {missing}"
-    return (lift, None) if safe else (None, f"no lift is safe: {lift.why}")
+    if safe is not None:
+        return safe, None
+    return None, f"{reason}; {missing}" if lift is None else f"no lift is safe: {lift.why}"
 
 
 def _repeat(explorer: Explorer, step: Step) -> None:

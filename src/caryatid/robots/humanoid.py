@@ -111,7 +111,7 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
         return float(np.linalg.norm(np.diff(driven, axis=0), axis=-1).sum())
 
     def _reach(self, T_world_camera: Array) -> tuple[Indices, Array, Array, Array]:
-        """Reason's index or −1 (N,), platform (N, 3), head yaw and pitch (N,) of poses (N, 4, 4)."""
+        """Index of the reason or −1 (N,), platform (N, 3), head yaw and pitch (N,) for poses (N, 4, 4)."""
         config = self._config
         eyes = T_world_camera[:, :3, 3]
         right, forward = T_world_camera[:, :3, 0], T_world_camera[:, :3, 2]

@@ -60,9 +60,9 @@ def one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
 def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
     """Call the kernel `work(index, data)` for each index below a count, on as many threads as numba uses.
 
-    Data are arrays and numbers, best a `NamedTuple`; results are written to arrays among them. The call for
-    one index must not change the data of another, so that the result is the same on any number of threads.
-    The kernel must not raise.
+    Data are arrays and numbers, preferably in a `NamedTuple`; results are written to arrays among them. The
+    call for one index must not change the data of another, so that the result is the same on any number of
+    threads. The kernel must not raise.
     """
     compiled = _compiled(work, data)
     on_threads(lambda index: compiled(index, data), count)

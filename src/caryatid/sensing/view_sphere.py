@@ -39,7 +39,7 @@ class ViewSphere:
         return self.centre_world + self.radius * self.directions
 
     def poses(self, directions: Array) -> Array:
-        """`T_world_camera` (M, 4, 4) in unit directions (M, 3) from the centre, looking at it without roll.
+        """Camera poses (M, 4, 4) in unit directions (M, 3) from the centre, looking at it without roll.
 
         Straight above and below, where the roll is open, the image's top points along world +x.
         """
@@ -53,7 +53,7 @@ class ViewSphere:
 def spread(direction_from: Array, directions: Array, sigma: float) -> Array:
     """Gaussians on the sphere, exp(−angle² / 2σ²): values (M, K) in unit directions (M, 3).
 
-    Their tops, where the value is 1, are unit vectors (K, 3); σ is an angle [rad].
+    Their centres, where the value is 1, are unit vectors (K, 3); σ is an angle [rad].
     """
     angle = np.arccos(np.clip(directions @ direction_from.T, -1.0, 1.0))
     return np.exp(-0.5 * (angle / sigma) ** 2)

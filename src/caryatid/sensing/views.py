@@ -235,7 +235,7 @@ def depth_behind(shape: Shape, depth: NDArray[np.float32], K: Array) -> Array:
 
 
 def check_intrinsics(K: Array, name: str) -> Array:
-    """Check a pinhole matrix (3, 3) [px] and return it as float64; the error calls it by a name.
+    """Check a pinhole matrix (3, 3) [px] and return it as float64; errors use the name.
 
     Raises:
         InputError: Wrong shape, NaN, or a focal length that is not positive.

@@ -28,7 +28,7 @@ from caryatid.sensing.views import View
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 """States of a voxel."""
-AROUND = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+AROUND = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]).astype(np.intp)
 """Steps (7, 3) to a voxel itself and to those that share a face with it [1]."""
 FULLY = float(np.cos(np.deg2rad(60.0)))
 """Cosine of the angle to its normal up to which a point is shown fully [1]."""
@@ -185,9 +185,18 @@ class VoxelMap:
         return _values_at(self.states, points_world, self.origin_world, self.config.size)
 
     def states_around(self, points_world: Array) -> NDArray[np.int8]:
-        """States (N, 7) of the voxels that hold points (N, 3) [m], and of those beside, by a face."""
-        around = points_world[:, None] + AROUND * self.config.size
-        return self.state_at(around.reshape(-1, 3)).reshape(-1, len(AROUND))
+        """States (N, 7) of the voxels that hold points (N, 3) [m] and of their six neighbours.
+
+        All seven are 0 in the outermost voxels of the map and outside it.
+        """
+        index = np.floor((points_world - self.origin_world) / self.config.size).astype(np.intp)
+        shape = self.states.shape
+        inside = ((index > 0) & (index < np.subtract(shape, 1))).all(axis=1)
+        place = index[inside] @ (shape[1] * shape[2], shape[2], 1)
+        steps = AROUND @ (shape[1] * shape[2], shape[2], 1)
+        states = np.zeros((len(index), len(AROUND)), dtype=np.int8)
+        states[inside] = self.states.ravel()[place[:, None] + steps]
+        return states
 
     def empty_at(self, points_world: Array) -> NDArray[np.bool_]:
         """Whether the voxels (N,) that hold points (N, 3) [m] were looked through and never hit.
