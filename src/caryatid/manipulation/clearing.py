@@ -100,7 +100,8 @@ def _lift(
         return None, None
     if safe is not None:
         return safe, None
-    return None, f"{reason}; {missing}" if lift is None else f"no lift is safe: {lift.why}"
+    unsafe = None if lift is None else f"no lift is safe: lifting {lift.object_id} {lift.why}"
+    return None, unsafe or f"{reason}; {missing}"
 
 
 def _repeat(explorer: Explorer, step: Step) -> None:

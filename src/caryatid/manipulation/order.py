@@ -183,10 +183,11 @@ def _step(rehearsal: _Rehearsal, trial: _Trial, left: Sequence[str]) -> TakeStep
         for s in rehearsal.graph.supports
         if s.supporter == trial.object_id and s.supported in left
     ]
-    what = f"supports {', '.join(carried)}" if carried else "supports no remaining object"
-    with_hold = f" while {', '.join(trial.hold)} is held" if trial.hold else ""
+    with_hold = f" with {', '.join(trial.hold)} held" if trial.hold else ""
     worst = ", ".join(f"{i} with probability {share:.2f}" for i, share in trial.harmed.items())
-    why = f"it {what}; lifting it{with_hold} disturbed {worst or 'nothing'} in {trial.rehearsals} rehearsals"
+    why = f"disturbed {worst or 'nothing'} in {trial.rehearsals} rehearsals{with_hold}"
+    if carried:
+        why += f"; supports {', '.join(carried)}"
     grasp, safe = rehearsal.grasp(trial.object_id), trial.risk <= rehearsal.accepted
     assert not isinstance(grasp, Blocked)
     if grasp is not None:
