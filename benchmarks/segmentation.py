@@ -120,7 +120,7 @@ def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
         if seen.view is None or view.labels is None:
             raise CaryatidError(f"{view.name}: has no masks to compare with")
         started = time.perf_counter()
-        labels = segment(seen.view, seen.surface, config.segmentation, config.cloud, config.fit, rng)
+        labels = segment(seen.view, seen.surface, config.segmentation, config.cloud, config.fit, rng)[0]
         known = {"source": Path(source).name, "view": number, "seconds": time.perf_counter() - started}
         rows.append(known | compare(labels[view.valid], view.labels[view.valid]))
     return rows

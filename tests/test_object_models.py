@@ -23,7 +23,7 @@ def observation_of(labels, shapes=(CRATE, CAN), eye=(-1.2, -0.6, 1.8), seed=0):
     points = np.concatenate([p for p, _ in parts])
     named = np.repeat(np.array(labels, dtype=np.int32), [len(p) for p, _ in parts])
     cloud = Cloud(points, np.concatenate([n for _, n in parts]), named)
-    return Observation(None, cloud, np.arange(len(points)), None)
+    return Observation(None, cloud, np.arange(len(points)), None, np.empty((0, 2), dtype=np.int32))
 
 
 @pytest.fixture

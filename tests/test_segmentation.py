@@ -12,9 +12,11 @@ from scipy.optimize import linear_sum_assignment
 from caryatid.config import CloudConfig, Config, FitConfig, SegmentationConfig, SurfaceConfig
 from caryatid.errors import PerceptionError
 from caryatid.geometry import transforms
+from caryatid.scene import Scene
 from caryatid.segmentation.affinities import OFFSETS, affinities
 from caryatid.segmentation.lccp import convex_parts
 from caryatid.segmentation.observation import observe
+from caryatid.segmentation.seams import GAP, cut_at_seams, find_seams
 from caryatid.segmentation.segments import cut_by_colour, segment, segment_cloud
 from caryatid.segmentation.support_plane import find_support_surface
 from caryatid.sensing.clouds import oriented_points, thin
@@ -37,7 +39,7 @@ def surface_of(view, up=UP, seed=0):
 def parts(view, surface=None, seed=0):
     rng = np.random.default_rng(seed)
     surface = surface or surface_of(view)
-    return segment(view, surface, SegmentationConfig(), CloudConfig(), FitConfig(), rng)
+    return segment(view, surface, SegmentationConfig(), CloudConfig(), FitConfig(), rng)[0]
 
 
 def found(labels, truth):
@@ -304,6 +306,42 @@ def test_bent_borders_prints_and_borders_between_parts_cut_nothing():
     two = PART.copy()
     two[5:35, 30:55] = 2
     np.testing.assert_array_equal(cut_by_colour(two, halves(), 40), two)
+
+
+def flush_boxes(gap):
+    """Two equal grey boxes that stand flush; a share of the border between them is a dark line."""
+    boxes = [(np.array([0.0, y, TABLE + 0.05]), np.array([0.12, 0.1, 0.1])) for y in (-0.0505, 0.0505)]
+    view = table_scene(from_the_side(elevation=60.0, distance=1.0), boxes, sigma=0.001)
+    rgb = np.where(view.labels[..., None] > 0, 150, 200) * np.ones(3)
+    first, second = (ndimage.binary_dilation(view.labels == k, iterations=2) for k in (1, 2))
+    line = np.argwhere(first & second)
+    line = line[: int(gap * len(line))]
+    rgb[line[:, 0], line[:, 1]] = 110
+    rgb += np.random.default_rng(0).normal(scale=2.0, size=rgb.shape)
+    return replace(view, rgb=np.clip(rgb, 0, 255).astype(np.uint8))
+
+
+@pytest.mark.parametrize(("gap", "number"), [(0.0, 1), (0.5, 1), (1.0, 2)], ids=["none", "half", "whole"])
+def test_equal_boxes_are_two_where_a_dark_line_runs_from_edge_to_edge(gap, number):
+    view = flush_boxes(gap)
+    labels = parts(view)
+    assert labels.max() == number
+    if number == 2:
+        assert found(labels, view.labels) == (2, 2, 2)
+    scene = Scene(segmentation="auto")
+    scene.update(view)
+    assert sum(o.role == "object" for o in scene.graph.objects) == number
+
+
+def test_steps_between_greys_and_bent_lines_are_no_seams():
+    v, u = np.mgrid[:80, :120]
+    step = np.where(u < 60, 90, 160)
+    bent = np.where(np.abs(u - 60 - 14 * np.sin(v / 12.0)) < 2, 90, 160)
+    straight = np.where(np.abs(u - 60 - 0.3 * v) < 2, 90, 160)
+    for image, number in ((step, 1), (bent, 1), (straight, 2)):
+        rgb = np.repeat(image[..., None], 3, axis=2).astype(np.uint8)
+        seam = find_seams(rgb, (slice(0, 80, 2), slice(0, 120, 2)))
+        assert cut_at_seams(PART, seam, GAP // 2, 40).max() == number
 
 
 def test_what_is_over_the_table_goes_by_height_and_outline():

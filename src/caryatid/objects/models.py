@@ -305,6 +305,9 @@ class ObjectModels:
         )
         if masks:
             self._distinct |= set(map(frozenset, combinations(np.unique(named[named > 0]).tolist(), 2)))
+        for pair in observation.apart:
+            names = frozenset(int(np.bincount(named[labels == label]).argmax()) for label in pair)
+            self._distinct |= {names} if len(names) == 2 else set()
         return observation.with_labels(np.where(labels == SUPPORT_LABEL, labels, named))
 
     def _other_colour(self, observation: Observation) -> NDArray[np.bool_] | None:

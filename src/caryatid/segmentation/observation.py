@@ -30,12 +30,14 @@ class Observation:
         cloud: Oriented points in the world frame with labels: 0 nothing, 65535 the support surface.
         pixels: Flat index (N,) of each point in the image, or in the cloud it came from.
         surface: The support surface as this view shows it.
+        apart: Pairs (P, 2) of labels, as `observe` gives them, that this view shows to be two bodies.
     """
 
     view: View | None
     cloud: Cloud
     pixels: NDArray[np.intp]
     surface: SupportSurface
+    apart: NDArray[np.int32]
 
     @property
     def labels(self) -> NDArray[np.int32]:
@@ -112,17 +114,19 @@ def observe(
     cloud, pixels = _points(source, config, known)
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     surface = _surface(cloud, given, known, UP, config, rng)
+    apart = np.empty((0, 2), dtype=np.int32)
     if given is not None:
         labels = given
     elif isinstance(source, View):
-        labels = segment(source, surface, config.segmentation, config.cloud, config.fit, rng).ravel()[pixels]
+        image, apart = segment(source, surface, config.segmentation, config.cloud, config.fit, rng)
+        labels = image.ravel()[pixels]
     else:
         labels = segment_cloud(cloud, surface, config.segmentation)
     reach = config.surface.tolerance
     on_surface = (labels == 0) & surface.over(cloud.points_world, -reach, reach, reach)
     labels = np.where(on_surface, np.int32(SUPPORT_LABEL), labels)
     view = source if isinstance(source, View) else None
-    return Observation(view, replace(cloud, labels=labels), pixels, surface)
+    return Observation(view, replace(cloud, labels=labels), pixels, surface, apart)
 
 
 def _with_whole_masks(view: View, jump: float) -> View:

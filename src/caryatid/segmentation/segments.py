@@ -27,6 +27,7 @@ from caryatid.segmentation.lccp import (
     wide_parts,
 )
 from caryatid.segmentation.samples import Samples, take_samples
+from caryatid.segmentation.seams import GAP, Pairs, cut_at_seams, divided, find_seams
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View, depth_behind
 
@@ -46,7 +47,7 @@ def segment(
     clouds: CloudConfig,
     fit_config: FitConfig,
     rng: np.random.Generator,
-) -> Labels:
+) -> tuple[Labels, Pairs]:
     """Cut one view into the parts on the support surface.
 
     Args:
@@ -58,13 +59,14 @@ def segment(
         rng: Draws the samples of their fits.
 
     Returns:
-        Label image (H, W): parts 1 … n, 0 = nothing and the surface itself.
+        Label image (H, W): parts 1 … n, 0 = nothing and the surface itself. Pairs (P, 2) of parts with a seam
+        between them, which are two bodies whatever shape they make together.
     """
-    labels = np.zeros(view.depth.shape, dtype=np.int32)
+    labels, apart = np.zeros(view.depth.shape, dtype=np.int32), np.empty((0, 2), dtype=np.int32)
     foreground = surface.pixels_over(view, config.clearance, config.max_height, config.margin)
     foreground &= (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
     if not foreground[:: config.stride, :: config.stride].any():
-        return labels
+        return labels, apart
     samples = take_samples(view, foreground, surface, config, clouds)
     points, normals = samples.points_camera, samples.normals_camera
     edges, steps = grid_edges(samples.places, points, normals, config.edge_jump)
@@ -78,13 +80,17 @@ def segment(
     part, enclosed = merge_insides(samples, part)
     if odds is not None:
         part = number_by_appearance(_with_share(part, odds[-1][samples.places] > 0.0, 0.5) - 1)
-    if samples.rgb is not None:
-        least = config.min_area / samples.spacing**2
+    uncut, width = samples.image(part), GAP // config.stride
+    if view.rgb is not None and samples.rgb is not None:
+        least, seam = config.min_area / samples.spacing**2, find_seams(view.rgb, samples.grid)
+        part = cut_at_seams(uncut, seam, width, least)[samples.places]
         part = cut_by_colour(samples.image(part), samples.rgb, least)[samples.places]
     part = merge_occluded(samples, part, config, fit_config, rng)
     # Readings of the surface with a common error exceed the clearance, but not by twice as much.
     part = number_by_appearance(_with_share(part, samples.height > 2.0 * config.clearance, 0.05) - 1)
-    labels[samples.grid] = samples.image(part)
+    labels[samples.grid] = image = samples.image(part)
+    if view.rgb is not None:
+        apart = divided(image, uncut, seam, width)
     around = tuple(slice(side.start, side.stop) for side in samples.grid)
     jump, rounds = np.float32(2.0 * config.edge_jump), 2 * config.stride
     waiting = foreground[around] & (labels[around] == 0)
@@ -96,7 +102,7 @@ def segment(
         waiting = low & (labels[around] == 0)
         rounds = int(np.sqrt(np.count_nonzero(waiting)))
         _spread_labels(labels[around], np.flatnonzero(waiting), view.depth[around], jump, rounds)
-    return labels
+    return labels, apart
 
 
 def _odds(samples: Samples, view: View, surface: SupportSurface) -> Odds:
