@@ -161,7 +161,7 @@ def open_dataset(
     """
     path = find_sample(path)
     if not path.exists():
-        raise InputError(path, "no such file or folder", "give a recording")
+        raise InputError(path, "no such file or folder", "give a recording, or `caryatid explore` a scene")
     known = format_of(path)
     if known is None:
         bags = "a bag (.bag, .mcap, .db3, or a folder with metadata.yaml)"

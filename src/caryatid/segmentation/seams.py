@@ -8,6 +8,7 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from caryatid.geometry.transforms import Array, unit
 from caryatid.segmentation.lccp import summed
 
 Labels = NDArray[np.int32]
@@ -20,6 +21,8 @@ DARK = 0.08
 """How much darker than its surroundings a seam is at least [1]: more than noise and the grain of surfaces."""
 CLOSED = 0.9
 """Minimum share of a border that is dark [1]: a seam runs from edge to edge, a print ends before."""
+TURN = np.cos(np.radians(45.0))
+"""Cosine of the maximum angle between faces that lie flush [1]: halfway to those of one box at its edge."""
 BEND = 1.0
 """Maximum standard deviation of a seam from a straight line [samples]: the spacing of the grid."""
 
@@ -43,11 +46,12 @@ def find_seams(rgb: NDArray[np.uint8], grid: tuple[slice, slice]) -> Mask:
     return np.asarray(bright < (1.0 - DARK) * around)
 
 
-def cut_at_seams(labels: Labels, seam: Mask, width: int, least: float) -> Labels:
+def cut_at_seams(labels: Labels, normals: Array, seam: Mask, width: int, least: float) -> Labels:
     """Cut parts along straight seams that run from edge to edge.
 
     Args:
         labels: Image (H, W) of parts 1 … n, 0 = none.
+        normals: Their unit normals (H, W, 3).
         seam: Where the image has seams (H, W).
         width: Width of a gap [samples].
         least: Minimum size of what lies between seams and edges [samples].
@@ -70,7 +74,7 @@ def cut_at_seams(labels: Labels, seam: Mask, width: int, least: float) -> Labels
         apart = part_of[core] != part
         nearest = ndimage.distance_transform_edt(apart, return_distances=False, return_indices=True)
         piece = np.where(own, core[tuple(nearest)], 0)
-        pairs, by_seam = _borders(piece, seam, width)
+        pairs, by_seam = _borders(piece, normals, seam, width)
         group = _groups(pairs[~by_seam], count)
         beside = group[pairs[by_seam]]
         for other in np.unique(beside[beside[:, 0] != beside[:, 1]])[1:]:
@@ -84,23 +88,26 @@ def _groups(pairs: Pairs, count: int) -> Labels:
     return np.asarray(connected_components(graph, directed=False)[1])
 
 
-def divided(labels: Labels, uncut: Labels, seam: Mask, width: int) -> Pairs:
+def divided(labels: Labels, uncut: Labels, normals: Array, seam: Mask, width: int) -> Pairs:
     """Pairs (P, 2) of parts with a straight seam between them.
 
     Args:
         labels: Image (H, W) of parts 1 … n, 0 = none.
         uncut: The parts before they were cut; only pieces of one of them are compared.
+        normals: Unit normals (H, W, 3).
         seam: Where the image has seams (H, W).
         width: Width of a gap [samples].
     """
     whole = np.zeros(int(labels.max(initial=0)) + 1, dtype=np.int32)
     whole[labels] = uncut
-    pairs, by_seam = _borders(labels, seam, width)
+    pairs, by_seam = _borders(labels, normals, seam, width)
     return pairs[by_seam & (whole[pairs[:, 0]] == whole[pairs[:, 1]])]
 
 
-def _borders(part: Labels, seam: Mask, width: int) -> tuple[Pairs, Mask]:
+def _borders(part: Labels, normals: Array, seam: Mask, width: int) -> tuple[Pairs, Mask]:
     """Pairs (B, 2) of parts 1 … n that meet in an image (H, W), and which (B,) have a seam between them."""
+    totals = [np.bincount(part.ravel(), along.ravel()) for along in np.moveaxis(normals, -1, 0)]
+    facing = unit(np.stack(totals, axis=-1))
     pairs, places = [], []
     for down, right in ((1, 0), (0, 1)):
         here, there = part[down:, right:], part[: len(part) - down, : part.shape[1] - right]
@@ -116,5 +123,6 @@ def _borders(part: Labels, seam: Mask, width: int) -> tuple[Pairs, Mask]:
     r, c, rr, rc, cc = (total / number for total in sums)
     spread = np.array([[rr - r * r, rc - r * c], [rc - r * c, cc - c * c]]).transpose(2, 0, 1)
     bend = np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[:, 0], 0.0))
+    flush = np.einsum("ij,ij->i", facing[joint[:, 0]], facing[joint[:, 1]]) >= TURN
     # A border no longer than two gaps are wide (a diagonal one counts twice) may be where a neck was cut.
-    return joint, (number > 4 * width) & (dark >= CLOSED * number) & (bend <= BEND)
+    return joint, flush & (number > 4 * width) & (dark >= CLOSED * number) & (bend <= BEND)

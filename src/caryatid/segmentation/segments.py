@@ -83,14 +83,16 @@ def segment(
     uncut, width = samples.image(part), GAP // config.stride
     if view.rgb is not None and samples.rgb is not None:
         least, seam = config.min_area / samples.spacing**2, find_seams(view.rgb, samples.grid)
-        part = cut_at_seams(uncut, seam, width, least)[samples.places]
+        facing = np.zeros((*uncut.shape, 3))
+        facing[samples.places] = normals
+        part = cut_at_seams(uncut, facing, seam, width, least)[samples.places]
         part = cut_by_colour(samples.image(part), samples.rgb, least)[samples.places]
     part = merge_occluded(samples, part, config, fit_config, rng)
     # Readings of the surface with a common error exceed the clearance, but not by twice as much.
     part = number_by_appearance(_with_share(part, samples.height > 2.0 * config.clearance, 0.05) - 1)
     labels[samples.grid] = image = samples.image(part)
     if view.rgb is not None:
-        apart = divided(image, uncut, seam, width)
+        apart = divided(image, uncut, facing, seam, width)
     around = tuple(slice(side.start, side.stop) for side in samples.grid)
     jump, rounds = np.float32(2.0 * config.edge_jump), 2 * config.stride
     waiting = foreground[around] & (labels[around] == 0)
