@@ -97,7 +97,7 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
         return row | {"cleared": float(not hands.left)}
     body = scene.object_bodies[goal]
     row |= {"goal": f"o{goal}", "cleared": float(any(t.body == body for t in lifted))}
-    return row | {"fewest": fewest(scene, body, config) if row["cleared"] else 0}
+    return row | {"fewest": fewest(scene, body, config)}
 
 
 def grasped(
@@ -162,7 +162,7 @@ def grasped(
 
 
 def fewest(scene: SimulatedScene, goal: str, config: Config) -> int:
-    """Number of lifts that take a body, each of which disturbs nothing; 0 where there are none."""
+    """Number of lifts that take a body, each of which disturbs nothing; 0 where 200 states show no way."""
     names = list(scene.object_bodies.values())
     lifting, target = Lifting(scene.spec, names), names.index(goal)
     queue = deque[tuple[tuple[int, ...], Array]]([((), poses_of(scene))])
@@ -196,6 +196,7 @@ def summary(rows: pd.DataFrame) -> dict[str, float]:
         found |= {f"grasps {name}": rows[name].sum() / rows["grasps"].sum() for name in ("clear", "held")}
     if "fewest" in rows:
         known = rows[(rows["cleared"] == 1.0) & (rows["fewest"] > 0)]
+        found |= {"a way exists": (rows["fewest"] > 0).mean()}
         found |= {"lifts": known["lifts"].sum(), "fewest": known["fewest"].sum()}
         found |= {"of the fewest": known["lifts"].sum() / max(known["fewest"].sum(), 1)}
     return found

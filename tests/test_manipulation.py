@@ -15,8 +15,10 @@ from synthetic import box, sphere, table_object, thing
 from caryatid.config import Config, GripperConfig, LiftConfig, RehearsalConfig, SupportConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.exploration import Explorer
 from caryatid.geometry.shapes import Uncertainty
 from caryatid.graph import Grasp, Support, SupportGraph, TakeStep
+from caryatid.manipulation.clearing import clear
 from caryatid.manipulation.dismantling import SimulatedHands, bodies_of
 from caryatid.manipulation.grasps import Blocked, find_grasp, gripper_boxes
 from caryatid.manipulation.order import plan_order
@@ -32,6 +34,7 @@ from caryatid.simulation.world import (
     quaternion,
     scene_from_spec,
 )
+from caryatid.sources import simulate
 from caryatid.steps import read_run, read_steps
 from caryatid.support.relations import infer
 
@@ -366,6 +369,20 @@ class TestCommands:
             document = json.loads(capsys.readouterr().out)
             assert (document["success"], document["stop"]) == (True, f"{goal} is removed")
             assert [step["object"] for step in document["steps"]] == taken
+
+    def test_it_looks_at_the_goal_before_it_takes_what_is_in_the_way(self):
+        table = simulate("bridge")
+        explorer = Explorer(table.camera, table.robot, config=CONFIG)
+        looked_for = {}
+
+        def take(step):
+            looked_for[step.object_id] = explorer.goal
+            return True
+
+        for step in clear(explorer, take, goal="o1"):
+            if step.lift is not None:
+                break
+        assert looked_for == {"o4": "o1"}
 
     def test_a_gripper_waits_until_its_path_is_seen(self, scene_file, tmp_path, capsys):
         """Above the table there is nothing to read a depth from, so that space stays unknown."""

@@ -29,7 +29,8 @@ def clear(
 
     A lift is safe if no other object moves with a probability above `config.rehearsal.risk`, as in
     `plan_order`; with a gripper, it also needs a grasp. It is carried out when no view of what it depends on
-    is worth its path. While no lift is safe, the robot keeps looking. Both end after
+    is worth its path, or with a goal, no view of what removing the goal depends on: such a view may show that
+    the lift is not needed. While no lift is safe, the robot keeps looking. Both end after
     `config.active.max_views` views since the previous lift. After each lift the robot looks again, and so
     detects objects that slid or fell.
 
@@ -91,7 +92,7 @@ def _lift(
         )
         lift, missing = next(iter(order.steps), None), order.refusal
     safe = lift if lift is not None and lift.safe else None
-    explorer.goal = None if safe is None else safe.object_id
+    explorer.goal = None if safe is None else goal or safe.object_id
     step = explorer.plan()
     # While no lift is safe, a view that shows little is worth its path too.
     enough = explorer.reason_to_stop() if safe or not found else step.stop
