@@ -28,14 +28,14 @@ BEND = 1.0
 
 
 def find_seams(rgb: NDArray[np.uint8], grid: tuple[slice, slice]) -> Mask:
-    """Find the places (H, W) of a grid that are darker than what surrounds them within the width of a gap.
+    """Find the places (M, N) of a grid that are darker than what surrounds them within the width of a gap.
 
     Little light comes out of the gap between two bodies, however narrow it is. At a border between two
     colours, neither is darker than both sides.
 
     Args:
-        rgb: Colours of the whole image.
-        grid: Rows and columns of the grid.
+        rgb: Colours (H, W, 3) of the whole image.
+        grid: M rows and N columns of it that are the grid's.
     """
     stride = grid[0].step or 1
     red, green, blue = rgb[grid[0].start : grid[0].stop, grid[1].start : grid[1].stop].transpose(2, 0, 1)
