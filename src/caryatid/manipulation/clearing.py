@@ -29,8 +29,8 @@ def clear(
 
     A lift is safe if no other object moves with a probability above `config.rehearsal.risk`, as in
     `plan_order`; with a gripper, it also needs a grasp. It is carried out when no view of what it depends on
-    is worth its path, or with a goal, no view of what removing the goal depends on: such a view may show that
-    the lift is not needed. While no lift is safe, the robot keeps looking. Both end after
+    is worth its path. With a goal, this is a view of what removing the goal depends on, because it may show
+    that nothing else has to go. While no lift is safe, the robot keeps looking. Both end after
     `config.active.max_views` views since the previous lift. After each lift the robot looks again, and so
     detects objects that slid or fell.
 

@@ -35,7 +35,7 @@ def find_seams(rgb: NDArray[np.uint8], grid: tuple[slice, slice]) -> Mask:
 
     Args:
         rgb: Colours (H, W, 3) of the whole image.
-        grid: M rows and N columns of it that are the grid's.
+        grid: Its M rows and N columns that form the grid.
     """
     stride = grid[0].step or 1
     red, green, blue = rgb[grid[0].start : grid[0].stop, grid[1].start : grid[1].stop].transpose(2, 0, 1)
