@@ -333,17 +333,27 @@ def test_equal_boxes_are_two_where_a_dark_line_runs_from_edge_to_edge(gap, numbe
     assert sum(o.role == "object" for o in scene.graph.objects) == number
 
 
-def test_steps_between_greys_bent_lines_and_edges_of_boxes_are_no_seams():
+def test_a_seam_is_dark_straight_and_as_long_as_its_border_and_divides_one_face():
     v, u = np.mgrid[:80, :120]
     step = np.where(u < 60, 90, 160)
     bent = np.where(np.abs(u - 60 - 14 * np.sin(v / 12.0)) < 2, 90, 160)
     straight = np.where(np.abs(u - 60 - 0.3 * v) < 2, 90, 160)
+    open_end = np.where(v < 59, straight, 160)
     left = (u < 60 + 0.3 * v)[::2, ::2, None]
     one, edge = np.broadcast_to(UP, (40, 60, 3)), np.where(left, UP, UP[[2, 0, 1]])
-    for image, facing, number in ((step, one, 1), (bent, one, 1), (straight, edge, 1), (straight, one, 2)):
+    neck = PART.copy()
+    neck[9:35, 28:36] = 0
+    for image, facing, part, number in (
+        (straight, one, PART, 2),
+        (straight, edge, PART, 1),
+        (straight, one, neck, 1),
+        (open_end, one, PART, 1),
+        (bent, one, PART, 1),
+        (step, one, PART, 1),
+    ):
         rgb = np.repeat(image[..., None], 3, axis=2).astype(np.uint8)
         seam = find_seams(rgb, (slice(0, 80, 2), slice(0, 120, 2)))
-        assert cut_at_seams(PART, facing, seam, GAP // 2, 40).max() == number
+        assert cut_at_seams(part, facing, seam, GAP // 2, 40).max() == number
 
 
 def test_what_is_over_the_table_goes_by_height_and_outline():
