@@ -172,6 +172,8 @@ def test_a_run_is_scored_against_the_ground_truth_of_its_own_source(tmp_path, ke
     assert run_command("extract", "sample-recording", "--out", run, "--no-report") == 0
     assert json.loads(scored(run))["views"][-1]["f1"] == 1.0
     assert scored(run) == scored(run, "sample-recording")
+    (warning,) = json.loads(scored(run, "tower"))["warnings"]
+    assert "matches one of tower" in warning
 
 
 def test_scenes_and_samples_are_listed_and_a_name_spelt_wrong_is_guessed(tmp_path, capsys):

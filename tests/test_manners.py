@@ -136,7 +136,7 @@ WORKING = {
     "demo": ("--scene tower --views 1 --out {out} {small}", {"run", "graph"}),
     "explore": ("{scene} --views 1 --out {out} {small}", {"run", "graph"}),
     "extract": ("{recording} --out {out}", {"run", "graph"}),
-    "evaluate": ("{run} {scenes}", {"views"}),
+    "evaluate": ("{run} {scenes}", {"views", "warnings"}),
     "order": ("{run} {quick}", {"steps", "safe", "refusal"}),
     "clear": ("{scene} --views 2 --out {out} {small} {quick}", {"success", "steps", "left"}),
     "import": ("{kept}/tum --camera {kept}/tum.json --out {out}", {"recording", "views", "frames"}),

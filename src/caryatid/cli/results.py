@@ -93,6 +93,7 @@ class Evaluate(options.Command):
         from caryatid.cli.output import table
         from caryatid.evaluation.truths import evaluate_run
 
+        output = self.output
         views = [{"view": n} | score.to_json() for n, score in enumerate(evaluate_run(self.run, self.truth))]
         columns = {
             "precision": "precision", "recall": "recall", "f1": "F1", "edge_precision": "edge\nprecision",
@@ -102,7 +103,7 @@ class Evaluate(options.Command):
         rows = [[f"{view['view'] + 1}", *(f"{view[name]:.3f}" for name in columns)] for view in views]
         truth = self.truth or "the ground truth of its source"
         shown = table(f"{self.run} against {truth}", ["view", *columns.values()], rows, figures=True)
-        self.output.result({"views": views}, shown)
+        output.result({"views": views, "warnings": output.warnings}, shown)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from caryatid.config import EvaluationConfig
@@ -13,6 +14,8 @@ from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, load_
 from caryatid.simulation.truth import GroundTruth, ground_truth, read_truth
 from caryatid.simulation.world import SimulatedScene, table_centre, true_shapes
 from caryatid.steps import read_run
+
+log = logging.getLogger(__name__)
 
 
 def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None = None) -> TrueScene:
@@ -46,6 +49,8 @@ def evaluate_run(
 ) -> tuple[Score, ...]:
     """Score every view of a run, in order, as `caryatid evaluate RUN [GT]` does.
 
+    Warn if no object of the last view matches: the truth is probably of something else.
+
     Args:
         run_folder: A run.
         truth: A built-in scene; an MJCF file or scene folder, with `gt.json` beside it or else compared with
@@ -77,4 +82,8 @@ def evaluate_run(
             why = "neither a scene nor a recording"
         remedy = "give a scene (scene.xml), or a recording with scene_camera.json and gt.json"
         raise InputError(source, why, remedy)
+    if not scores[-1].ious and len(run.views[-1].graph.objects) > 1:
+        log.warning(
+            "%s: none of its objects matches one of %s; give the ground truth of this run", run_folder, source
+        )
     return tuple(scores)
