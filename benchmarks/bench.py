@@ -107,7 +107,7 @@ def compare(rows_by_name: Mapping[str, Sequence[Row]], part: bool, console: Cons
     What is worse is measured again, and the better figure counts: chance makes one worse more easily than
     better. What could not be measured, for want of a peer, is told and does not fail, unless nothing was.
     """
-    known = {m.name: m.value for m in read_baseline(BASELINE)}
+    known = read_baseline(BASELINE)
     found = {m.name: m for rows in rows_by_name.values() for m in measures(rows)}
     for name in [] if part else [n for n in known if n not in found]:
         console.print(f"not measured: {name}")

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -126,28 +126,22 @@ class Gated(Spread):
         return gate(found, baseline, console) if self.gate else 0
 
 
-def write_baseline(measures: Iterable[Measure], path: Path) -> None:
-    """Write measures as the baseline to compare with from now on."""
-    document = {m.name: asdict(m) for m in measures}
-    path.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-
-
-def update_baseline(found: Sequence[Measure], path: Path, kept: Callable[[str], bool]) -> None:
+def update_baseline(found: Iterable[Measure], path: Path, kept: Callable[[str], bool]) -> None:
     """Write measures as the baseline; others stay there where `kept` says so of their names."""
-    names = {m.name for m in found}
-    others = [m for m in read_baseline(path) if m.name not in names and kept(m.name)]
-    write_baseline([*others, *found], path)
+    values = {name: value for name, value in read_baseline(path).items() if kept(name)}
+    values |= {m.name: m.value for m in found}
+    path.write_text(json.dumps(values, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def read_baseline(path: Path) -> list[Measure]:
-    """Read the measures of a baseline."""
-    return [Measure(**known) for known in json.loads(path.read_text(encoding="utf-8")).values()]
+def read_baseline(path: Path) -> dict[str, float]:
+    """Read the value of each measure of a baseline."""
+    values: dict[str, float] = json.loads(path.read_text(encoding="utf-8"))
+    return values
 
 
 def gate(measures: Iterable[Measure], path: Path, console: Console) -> int:
     """Compare with a baseline; returns the exit status, 1 where a measure is worse than it may be."""
-    baseline = {m.name: m.value for m in read_baseline(path)}
-    failed = 0
+    baseline, failed = read_baseline(path), 0
     for m in measures:
         if m.name not in baseline:
             console.print(f"new: {m.name} = {m.value:.4g} {m.unit}")
