@@ -1,12 +1,12 @@
 """Train the network of automatic segmentation on simulated tables.
 
 python tools/train_affinities.py scenes FOLDER [--count N] [--seed S]    render N scenes, 8 views each
-python tools/train_affinities.py train FOLDER [--minutes M] [--start FILE] [--out FILE]   needs torch, onnx
+python tools/train_affinities.py train FOLDER [--minutes M] [--out FILE]                 needs torch, onnx
 
 Scenes hold random objects of one to a dozen convex parts: tools, bottles, mugs, bowls, toys, boxes. They fall
 onto a table, onto or into a larger object, or stand in rows. They are plain, printed or painted part by part.
 Images are noise-free; each training crop gets noise, gaps, mixed pixels and colours of its own. 1,800 such
-scenes and two hours on two cores are enough; `--start` goes on from an earlier network.
+scenes and two hours on two cores are enough.
 """
 
 from __future__ import annotations
@@ -611,7 +611,7 @@ def feed(queue: Any, folder: Path, seed: int) -> None:
         queue.put(batch)
 
 
-def train(folder: Path, minutes: float, start: Path | None, out: Path) -> None:
+def train(folder: Path, minutes: float, out: Path) -> None:
     import torch
     import torch.multiprocessing as processes
     from torch import nn
@@ -632,11 +632,6 @@ def train(folder: Path, minutes: float, start: Path | None, out: Path) -> None:
             self.down = nn.ModuleList(nn.Sequential(layer(a, b, 2), layer(b, b)) for a, b in pairwise(widths))
             self.up = nn.ModuleList(nn.Sequential(layer(a + b, a), layer(a, a)) for a, b in pairwise(widths))
             self.last = nn.Sequential(layer(widths[0] // 4 + 8, 16), nn.Conv2d(16, len(OFFSETS) + 1, 1))
-
-        def modules_in_order(self) -> Iterator[Any]:
-            """All layers, in the order in which they run."""
-            for part in (self.full, self.stem, self.down, *reversed(self.up), self.last):
-                yield from part.modules()
 
         def forward(self, x: Any) -> Any:
             full, levels = self.full(x), [self.stem(x)]
@@ -668,23 +663,6 @@ def train(folder: Path, minutes: float, start: Path | None, out: Path) -> None:
     torch.manual_seed(0)
     network = Network().to(memory_format=torch.channels_last)
     most = 2e-3
-    if start is not None:
-        # Where it is stored, normalisation is part of the weights.
-        network.eval()
-        most = 1e-3
-        weights = map(torch.from_numpy, stored_weights(start))
-        layers = [m for m in network.modules_in_order() if isinstance(m, (nn.Conv2d, nn.BatchNorm2d))]
-        with torch.no_grad():
-            for m in layers:
-                if isinstance(m, nn.Conv2d):
-                    known = next(weights)
-                    m.weight.zero_()[:, : known.shape[1]] = known
-                    if m.bias is None:
-                        bias = next(weights)
-                    else:
-                        m.bias.copy_(next(weights))
-                else:
-                    m.bias.copy_(bias)
     steps = torch.optim.AdamW(network.parameters(), lr=most, weight_decay=1e-4)
     queue = processes.Queue(6)
     processes.Process(target=feed, args=(queue, folder, 1), daemon=True).start()
@@ -710,18 +688,6 @@ def train(folder: Path, minutes: float, start: Path | None, out: Path) -> None:
         network.eval(), (torch.zeros(1, CHANNELS, 256, 320),), out, dynamo=False, opset_version=17, **names
     )
     store_in_half(out)
-
-
-def stored_weights(model: Path) -> Iterator[Any]:
-    """Weights and biases of the convolutions of a stored network, in the order in which they run."""
-    import onnx
-    from onnx import numpy_helper
-
-    graph = onnx.load(model).graph
-    known = {w.name.removesuffix("_half"): numpy_helper.to_array(w) for w in graph.initializer}
-    for node in graph.node:
-        if node.op_type == "Conv":
-            yield from (known[name].astype(np.float32) for name in node.input[1:3])
 
 
 def store_in_half(model: Path) -> None:
@@ -753,13 +719,12 @@ def main() -> None:
     scenes.add_argument("--count", type=int, default=1800)
     scenes.add_argument("--seed", type=int, default=0)
     training.add_argument("--minutes", type=float, default=120.0)
-    training.add_argument("--start", type=Path, help="go on from this network")
     training.add_argument("--out", type=Path, default=Path(MODEL))
     given = parser.parse_args()
     if given.command == "scenes":
         make_scenes(given.folder, given.count, given.seed)
     else:
-        train(given.folder, given.minutes, given.start, given.out)
+        train(given.folder, given.minutes, given.out)
 
 
 if __name__ == "__main__":
