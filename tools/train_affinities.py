@@ -11,7 +11,6 @@ scenes and two hours on two cores are enough.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -20,36 +19,40 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from caryatid.config import SensorConfig
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
 from caryatid.segmentation.affinities import MODEL, OFFSETS, features
+from caryatid.sensing.view_sphere import direction
+from caryatid.simulation.camera import depth_edges, intrinsics, pixel_rays
+from caryatid.simulation.world import quaternion
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 Part = dict[str, Any]
 Maker = Callable[[Rng], list[Part]]
 GEOM = mujoco.mjtGeom
 WIDTH, HEIGHT, VIEWS = 320, 240, 8
 CROP, BATCH, CHANNELS = 192, 16, 11
+UNTURNED = np.eye(3)
 
 
 # Objects, made of parts around the origin [m]
 
 
-def solid(kind: Any, size: Any, at: Any = (0.0, 0.0, 0.0), R: Array | None = None) -> Part:
-    quat = np.array([1.0, 0.0, 0.0, 0.0])
-    if R is not None:
-        mujoco.mju_mat2Quat(quat, np.ascontiguousarray(R).reshape(-1))
-    return {"type": kind, "size": np.array(size, dtype=float), "pos": np.array(at, dtype=float), "quat": quat}
+def solid(kind: Any, size: Any, at: Any = (0.0, 0.0, 0.0), R: Array = UNTURNED) -> Part:
+    return {"type": kind, "size": np.array(size), "pos": np.array(at), "quat": quaternion(R)}
 
 
 def hull(points: Any) -> Part:
     return {"points": np.asarray(points, dtype=float)}
 
 
-def block(size: Any, at: Any = (0.0, 0.0, 0.0), R: Array | None = None) -> Part:
+def block(size: Any, at: Any = (0.0, 0.0, 0.0), R: Array = UNTURNED) -> Part:
     return solid(GEOM.mjGEOM_BOX, size, at, R)
 
 
@@ -360,19 +363,14 @@ def painted(rng: Rng, geoms: Sequence[int], model: Any) -> Callable[[Array, Arra
         for g in geoms if edge else ():
             if model.geom_type[g] == GEOM.mjGEOM_BOX:  # edges are dark, or worn
                 own = on == g
-                at = (points[own] - model.geom_pos[g]) @ _matrix(model.geom_quat[g])
+                R = Rotation.from_quat(model.geom_quat[g], scalar_first=True).as_matrix()
+                at = (points[own] - model.geom_pos[g]) @ R
                 shown[own] *= np.where((np.abs(at) > model.geom_size[g] - edge).sum(axis=1) > 1, 0.5, 1.0)[
                     :, None
                 ]
         return shown
 
     return colour
-
-
-def _matrix(quat: Array) -> Array:
-    R = np.zeros(9)
-    mujoco.mju_quat2Mat(R, quat)
-    return R.reshape(3, 3)
 
 
 def ground(rng: Rng) -> Callable[[Array, Array], Array]:
@@ -429,36 +427,28 @@ def rendered(
     target[:2] += on_table[:, :2].mean(axis=0) if len(on_table) else 0.0
     rise = np.radians(rng.uniform(18.0, 65.0) if rng.random() < 0.8 else rng.uniform(65.0, 89.0))
     azimuth, roll = rng.uniform(-np.pi, np.pi), 0.08 * rng.normal()
-    z = -np.array([np.cos(rise) * np.cos(azimuth), np.cos(rise) * np.sin(azimuth), np.sin(rise)])
-    eye = target - rng.uniform(0.45, 1.5) * z
-    x = np.cross(z, [0.0, 0.0, 1.0]) / np.cos(rise)
-    y = np.cross(z, x)
-    x, y = np.cos(roll) * x + np.sin(roll) * y, np.cos(roll) * y - np.sin(roll) * x
-    u, v = (np.arange(WIDTH) - (WIDTH - 1) / 2.0) / focal, (np.arange(HEIGHT) - (HEIGHT - 1) / 2.0) / focal
-    rays = (u[None, :, None] * x + v[:, None, None] * y + z).reshape(-1, 3)
+    eye = target + rng.uniform(0.45, 1.5) * direction(azimuth, rise)
+    R = transforms.look_at(eye, target)[:3, :3] @ transforms.rotation_from_vector((0.0, 0.0, roll))
+    K = intrinsics(SensorConfig(width=WIDTH, height=HEIGHT, focal=focal))
+    rays, lengths = pixel_rays(K, R, WIDTH, HEIGHT)
     geoms, depth, normals = np.empty(len(rays), dtype=np.int32), np.empty(len(rays)), np.empty((len(rays), 3))
     everything = geoms, depth, normals.reshape(-1)
     mujoco.mj_multiRay(model, data, eye, rays.ravel(), None, 1, -1, *everything, len(rays), 6.0)
     inverse = np.where(geoms >= 0, 1.0 / np.maximum(depth, 0.05), 0.0)
-    cosine = np.abs(np.einsum("ij,ij->i", normals, rays)) / np.linalg.norm(rays, axis=1)
-    images: dict[str, tuple[Array, Any]] = {
-        "inverse": (20000.0 * inverse, np.uint16),
-        "cosine": (255.0 * cosine, np.uint8),
+    towards = np.einsum("ij,ij->i", normals, rays)
+    points, normals = eye + rays * np.maximum(depth, 0.0)[:, None], normals * -np.sign(towards)[:, None]
+    images = {
+        "inverse": np.minimum(20000.0 * inverse, 65535.0).astype(np.uint16),
+        "cosine": (255.0 * np.abs(towards) / lengths).astype(np.uint8),
+        "labels": np.append(labels, 0)[geoms].astype(np.uint8),
+        "rgb": coloured(model, data, points, normals, geoms, paint, rng),
     }
-    known = {
-        k: np.minimum(v, np.iinfo(t).max).astype(t).reshape(HEIGHT, WIDTH) for k, (v, t) in images.items()
-    }
-    shown = np.append(labels, 0)[geoms].astype(np.uint8).reshape(HEIGHT, WIDTH)
-    points, normals = (
-        eye + rays * np.maximum(depth, 0.0)[:, None],
-        normals * -np.sign(np.einsum("ij,ij->i", normals, rays))[:, None],
-    )
-    rgb = coloured(model, data, points, normals, geoms, paint, rng)
-    known["rgb"] = rgb.reshape(HEIGHT, WIDTH, 3)
-    return known | {"labels": shown, "focal": focal, "up": np.array([x[2], y[2], z[2]]), "height": eye[2]}
+    known = {name: image.reshape(HEIGHT, WIDTH, *image.shape[1:]) for name, image in images.items()}
+    return known | {"focal": focal, "up": R[2], "height": eye[2]}
 
 
-def make_scenes(folder: Path, count: int, seed: int) -> None:
+def make_scenes(folder: tyro.conf.Positional[Path], count: int = 1800, seed: int = 0) -> None:
+    """Render scenes, 8 views each."""
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(count):
         rng = np.random.default_rng([seed, number])
@@ -512,19 +502,14 @@ def crop(views: dict[str, Any], rng: Rng) -> tuple[Any, ...] | None:
     scale = rng.uniform(0.75, 1.35)
     depth = noisy(np.ascontiguousarray(inverse / scale), cosine / 255.0, rng)
     if rng.random() < 0.25:  # something transparent: readings lie behind it, or nowhere
-        clear = labels == labels[rows_of(labels, rng)]
+        places = labels[labels > 0]
+        clear = labels == (places[int(rng.integers(len(places)))] if len(places) else 0)
         depth = np.where(clear, depth + 0.06 * np.maximum(waves(rng, 8, 40), 0.0), depth)
         depth = np.where(clear & (waves(rng, 8, 40) > rng.uniform(-0.5, 1.5)), 0.0, depth)
         depth = depth.astype(np.float32)
     K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
     seen = None if rng.random() < 0.2 else photographed(rgb, rng)
     return depth, seen, labels, K, up, height * scale + 0.002 * rng.normal()
-
-
-def rows_of(labels: Any, rng: Rng) -> tuple[int, int]:
-    """A place of an object, or the middle if there is none."""
-    places = np.argwhere(labels > 0)
-    return tuple(places[int(rng.integers(len(places)))]) if len(places) else (CROP // 2, CROP // 2)
 
 
 def photographed(rgb: Any, rng: Rng) -> Any:
@@ -566,11 +551,7 @@ def noisy(inverse: Any, cosine: Any, rng: Rng) -> Any:
         inverse = np.round(inverse / step) * step
     gone = cosine < np.cos(np.radians(rng.uniform(70.0, 88.0)))
     if rng.random() < 0.7:  # no readings beside steps
-        edge, jump = np.zeros(true.shape, dtype=bool), rng.uniform(0.01, 0.05)
-        for image, values in ((edge, true), (edge.T, true.T)):
-            step_here = np.abs(np.diff(values, axis=0)) > jump
-            image[1:] |= step_here
-            image[:-1] |= step_here
+        edge = depth_edges(true, rng.uniform(0.01, 0.05))
         edge = ndimage.binary_dilation(edge) if rng.random() < 0.4 else edge
         gone |= edge & (rng.random(edge.shape) < (rng.uniform(0.3, 1.0) if rng.random() < 0.5 else 1.0))
     if rng.random() < 0.5:  # black or shiny places
@@ -591,8 +572,8 @@ def waves(rng: Rng, fewest: int, most: int) -> Any:
 # Training
 
 
-def batches(folder: Path, seed: int) -> Iterator[tuple[Any, Any, Any]]:
-    """Features (B, 11, H, W), labels (B, H, W) and which samples have readings (B, H, W)."""
+def feed(queue: Any, folder: Path, seed: int) -> None:
+    """Put in features (B, 11, H, W), labels (B, H, W) and which samples have readings (B, H, W), for ever."""
     rng, scenes = np.random.default_rng(seed), dict[Path, dict[str, Any]]()
     while True:
         files, crops = sorted(folder.glob("*.npz")), list[tuple[Any, ...]]()
@@ -603,15 +584,12 @@ def batches(folder: Path, seed: int) -> Iterator[tuple[Any, Any, Any]]:
             if (found := crop(scenes[file], rng)) is not None:
                 crops.append(found)
         seen = np.stack([features(depth, rgb, *pose) for depth, rgb, _, *pose in crops])
-        yield seen, np.stack([c[2] for c in crops]).astype(np.int64), np.stack([c[0] > 0.0 for c in crops])
+        labels = np.stack([c[2] for c in crops]).astype(np.int64)
+        queue.put((seen, labels, np.stack([c[0] > 0.0 for c in crops])))
 
 
-def feed(queue: Any, folder: Path, seed: int) -> None:
-    for batch in batches(folder, seed):
-        queue.put(batch)
-
-
-def train(folder: Path, minutes: float, out: Path) -> None:
+def train(folder: tyro.conf.Positional[Path], minutes: float = 120.0, out: Path = Path(MODEL)) -> None:
+    """Train a network on rendered scenes."""
     import torch
     import torch.multiprocessing as processes
     from torch import nn
@@ -708,24 +686,5 @@ def store_in_half(model: Path) -> None:
     onnx.save(whole, model)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    commands = parser.add_subparsers(dest="command", required=True)
-    scenes, training = commands.add_parser("scenes"), commands.add_parser("train")
-    for command in (scenes, training):
-        command.add_argument("folder", type=Path)
-    scenes.add_argument("--count", type=int, default=1800)
-    scenes.add_argument("--seed", type=int, default=0)
-    training.add_argument("--minutes", type=float, default=120.0)
-    training.add_argument("--out", type=Path, default=Path(MODEL))
-    given = parser.parse_args()
-    if given.command == "scenes":
-        make_scenes(given.folder, given.count, given.seed)
-    else:
-        train(given.folder, given.minutes, given.out)
-
-
 if __name__ == "__main__":
-    main()
+    tyro.extras.subcommand_cli_from_dict({"scenes": make_scenes, "train": train}, description=__doc__)

@@ -40,7 +40,7 @@ def add_depth_noise(depth: Array, incidence: Array, config: NoiseConfig, rng: np
         Depth (H, W) [m], 0 = no reading.
     """
     near, far = config.range
-    seen = (depth > 0.0) & (incidence <= np.deg2rad(config.grazing)) & ~_depth_edges(depth, config.edge_jump)
+    seen = (depth > 0.0) & (incidence <= np.deg2rad(config.grazing)) & ~depth_edges(depth, config.edge_jump)
     noisy = depth + axial_sigma(depth, config) * rng.standard_normal(depth.shape)
     noisy = np.maximum(noisy, near / 2.0)
     steps = np.maximum(np.round(1.0 / (noisy * config.disparity_step)), 1.0)
@@ -48,7 +48,7 @@ def add_depth_noise(depth: Array, incidence: Array, config: NoiseConfig, rng: np
     return np.where(seen & (quantised >= near) & (quantised <= far), quantised, 0.0)
 
 
-def _depth_edges(depth: Array, jump: float) -> NDArray[np.bool_]:
+def depth_edges(depth: Array, jump: float) -> NDArray[np.bool_]:
     """Pixels (H, W) on either side of a step of more than `jump` [m] to a direct neighbour."""
     edges = np.zeros(depth.shape, dtype=bool)
     for pixels, values in ((edges, depth), (edges.T, depth.T)):
