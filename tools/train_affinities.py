@@ -36,9 +36,13 @@ Rng = np.random.Generator
 Part = dict[str, Any]
 Maker = Callable[[Rng], list[Part]]
 GEOM = mujoco.mjtGeom
+BOX, CYLINDER, CAPSULE, ELLIPSOID = (
+    GEOM.mjGEOM_BOX, GEOM.mjGEOM_CYLINDER, GEOM.mjGEOM_CAPSULE, GEOM.mjGEOM_ELLIPSOID,
+)  # fmt: skip
 WIDTH, HEIGHT, VIEWS = 320, 240, 8
 CROP, BATCH, CHANNELS = 192, 16, 11
 UNTURNED = np.eye(3)
+ALONG_X = Rotation.from_euler("y", 90.0, degrees=True).as_matrix()
 
 
 # Objects, made of parts around the origin [m]
@@ -53,7 +57,7 @@ def hull(points: Any) -> Part:
 
 
 def block(size: Any, at: Any = (0.0, 0.0, 0.0), R: Array = UNTURNED) -> Part:
-    return solid(GEOM.mjGEOM_BOX, size, at, R)
+    return solid(BOX, size, at, R)
 
 
 def ring(radius: float, height: float, corners: int) -> Array:
@@ -77,7 +81,7 @@ def chain(points: Array, radii: Any) -> list[Part]:
     parts = []
     for (p, q), radius in zip(pairwise(points), radii, strict=True):
         R = Rotation.align_vectors([q - p], [[0.0, 0.0, 1.0]])[0].as_matrix()
-        parts.append(solid(GEOM.mjGEOM_CAPSULE, (radius, np.linalg.norm(q - p) / 2.0, 0.0), (p + q) / 2.0, R))
+        parts.append(solid(CAPSULE, (radius, np.linalg.norm(q - p) / 2.0, 0.0), (p + q) / 2.0, R))
     return parts
 
 
@@ -86,11 +90,11 @@ def box(rng: Rng) -> list[Part]:
 
 
 def can(rng: Rng) -> list[Part]:
-    return [solid(GEOM.mjGEOM_CYLINDER, (rng.uniform(0.012, 0.06), rng.uniform(0.01, 0.1), 0.0))]
+    return [solid(CYLINDER, (rng.uniform(0.012, 0.06), rng.uniform(0.01, 0.1), 0.0))]
 
 
 def ball(rng: Rng) -> list[Part]:
-    return [solid(GEOM.mjGEOM_ELLIPSOID, rng.uniform(0.02, 0.055) * rng.uniform(0.6, 1.0, 3))]
+    return [solid(ELLIPSOID, rng.uniform(0.02, 0.055) * rng.uniform(0.6, 1.0, 3))]
 
 
 def book(rng: Rng) -> list[Part]:
@@ -111,9 +115,7 @@ def bottle(rng: Rng) -> list[Part]:
         size = rng.uniform(0.01, 0.03), 0.008, rng.uniform(0.005, 0.015)
         parts.append(block(size, (rng.uniform(0.0, 0.02), 0.0, heights[-1])))
     if rng.random() < 0.2:
-        parts.append(
-            solid(GEOM.mjGEOM_CAPSULE, (0.007, 0.15 * height, 0.0), (radius + 0.015, 0.0, 0.45 * height))
-        )
+        parts.append(solid(CAPSULE, (0.007, 0.15 * height, 0.0), (radius + 0.015, 0.0, 0.45 * height)))
     return parts
 
 
@@ -154,12 +156,11 @@ def banana(rng: Rng) -> list[Part]:
 
 def drill(rng: Rng) -> list[Part]:
     length, radius = rng.uniform(0.05, 0.1), rng.uniform(0.018, 0.032)
-    along = Rotation.from_euler("y", 90.0, degrees=True).as_matrix()
-    parts = [solid(GEOM.mjGEOM_CYLINDER, (radius, length, 0.0), R=along)]
+    parts = [solid(CYLINDER, (radius, length, 0.0), R=ALONG_X)]
     chuck = radius * rng.uniform(0.3, 0.7), rng.uniform(0.01, 0.03), 0.0
-    parts.append(solid(GEOM.mjGEOM_CYLINDER, chuck, (length + 0.015, 0.0, 0.0), along))
+    parts.append(solid(CYLINDER, chuck, (length + 0.015, 0.0, 0.0), ALONG_X))
     if rng.random() < 0.5:
-        parts.append(solid(GEOM.mjGEOM_CYLINDER, (0.2 * radius, 0.02, 0.0), (length + 0.05, 0.0, 0.0), along))
+        parts.append(solid(CYLINDER, (0.2 * radius, 0.02, 0.0), (length + 0.05, 0.0, 0.0), ALONG_X))
     grip = rng.uniform(0.03, 0.06)
     tilt = Rotation.from_euler("y", rng.uniform(-20.0, 20.0), degrees=True).as_matrix()
     at = -length * rng.uniform(0.1, 0.7), 0.0, -radius - 0.8 * grip
@@ -175,14 +176,13 @@ def tool(rng: Rng) -> list[Part]:
     length, width = rng.uniform(0.05, 0.13), rng.uniform(0.006, 0.016)
     parts = [block((length, width, rng.uniform(0.005, 0.014)))]
     if rng.random() < 0.5:
-        along = Rotation.from_euler("y", 90.0, degrees=True).as_matrix()
-        parts = [solid(GEOM.mjGEOM_CAPSULE, (max(width, 0.007), length, 0.0), R=along)]
+        parts = [solid(CAPSULE, (max(width, 0.007), length, 0.0), R=ALONG_X)]
     for _ in range(int(rng.integers(1, 4))):
         at = (
             rng.choice([-1.0, 1.0]) * length * rng.uniform(0.3, 1.0),
             *rng.uniform((-0.02, -0.005), (0.02, 0.005)),
         )
-        kind = GEOM.mjGEOM_BOX if rng.random() < 0.6 else GEOM.mjGEOM_ELLIPSOID
+        kind = BOX if rng.random() < 0.6 else ELLIPSOID
         parts.append(solid(kind, rng.uniform(0.008, 0.035, 3), at))
     return parts
 
@@ -197,9 +197,7 @@ def toy(rng: Rng) -> list[Part]:
             reach = 0.75 * radii[onto] + 0.5 * radius
             centres.append(centres[onto] + way / np.linalg.norm(way) * reach)
             radii.append(radius)
-        kind = [GEOM.mjGEOM_ELLIPSOID, GEOM.mjGEOM_BOX, GEOM.mjGEOM_CYLINDER][
-            int(rng.choice(3, p=(0.6, 0.25, 0.15)))
-        ]
+        kind = [ELLIPSOID, BOX, CYLINDER][int(rng.choice(3, p=(0.6, 0.25, 0.15)))]
         size = radii[-1] * rng.uniform(0.6, 1.1, 3)
         parts.append(solid(kind, size, centres[-1], Rotation.random(random_state=rng).as_matrix()))
     return parts
@@ -273,17 +271,14 @@ def bodies(rng: Rng) -> Iterator[tuple[list[Part], float, Array, Rotation]]:
         return
     for k in range(count):
         parts = same if same and rng.random() < 0.9 else drawn(rng, makers)
-        scale = (
-            1.0 if same else rng.uniform(0.75, 1.2) * (rng.uniform(0.5, 1.0) if 0.5 <= kind < 0.65 else 1.0)
-        )
-        yaw = (
-            int(rng.integers(4)) * np.pi / 2.0 + 0.03 * rng.normal() if level else rng.uniform(-np.pi, np.pi)
-        )
+        scale = 1.0 if same else rng.uniform(0.75, 1.2)
+        if 0.5 <= kind < 0.65:
+            scale *= rng.uniform(0.5, 1.0)
+        yaw = rng.integers(4) * np.pi / 2.0 + 0.03 * rng.normal() if level else rng.uniform(-np.pi, np.pi)
         R, fate = Rotation.from_euler("z", yaw), rng.random()
         if fate < 0.3:
-            R = R * Rotation.from_euler(
-                "xyz", [[90, 0, 0], [0, 90, 0], [180, 0, 0]][int(rng.integers(3))], degrees=True
-            )
+            axis, angle = [("x", 90.0), ("y", 90.0), ("x", 180.0)][int(rng.integers(3))]
+            R = R * Rotation.from_euler(axis, angle, degrees=True)
         elif fate < 0.5:
             R = Rotation.random(random_state=rng)
         xy = 0.4 * spread * rng.normal(size=2)
@@ -298,12 +293,12 @@ def settled(rng: Rng) -> tuple[Any, Any, NDArray[np.int32]]:
         type=GEOM.mjGEOM_PLANE, size=[5.0, 5.0, 0.1], pos=[0.0, 0.0, -rng.uniform(0.4, 0.9)]
     )
     table = rng.uniform(0.45, 0.9, 2)
-    spec.worldbody.add_geom(type=GEOM.mjGEOM_BOX, size=[*table, 0.02], pos=[0.0, 0.0, -0.02])
+    spec.worldbody.add_geom(type=BOX, size=[*table, 0.02], pos=[0.0, 0.0, -0.02])
     if rng.random() < 0.4:
         angle, away = float(rng.uniform(-np.pi, np.pi)), table.max() + rng.uniform(0.05, 1.0)
         there = [away * np.cos(angle), away * np.sin(angle), 0.0]
         quat = [np.cos(angle / 2.0), 0.0, 0.0, np.sin(angle / 2.0)]
-        spec.worldbody.add_geom(type=GEOM.mjGEOM_BOX, size=[0.05, 3.0, 2.0], pos=there, quat=quat)
+        spec.worldbody.add_geom(type=BOX, size=[0.05, 3.0, 2.0], pos=there, quat=quat)
     matter = {"density": 400.0, "friction": [0.9, 0.02, 0.002], "condim": 4}
     for number, (parts, scale, at, R) in enumerate(bodies(rng)):
         body = spec.worldbody.add_body(name=f"object{number}", pos=at, quat=R.as_quat()[[3, 0, 1, 2]])
@@ -361,7 +356,7 @@ def painted(rng: Rng, geoms: Sequence[int], model: Any) -> Callable[[Array, Arra
                 inside &= np.sin(2.0 * np.pi * (points @ lines)) > 0.2
             shown[inside] = colours[number]
         for g in geoms if edge else ():
-            if model.geom_type[g] == GEOM.mjGEOM_BOX:  # edges are dark, or worn
+            if model.geom_type[g] == BOX:  # edges are dark, or worn
                 own = on == g
                 R = Rotation.from_quat(model.geom_quat[g], scalar_first=True).as_matrix()
                 at = (points[own] - model.geom_pos[g]) @ R
@@ -471,11 +466,8 @@ def make_scenes(folder: tyro.conf.Positional[Path], count: int = 1800, seed: int
 def crop(views: dict[str, Any], rng: Rng) -> tuple[Any, ...] | None:
     """Noisy depth, colours, labels, K, up and height of a crop around objects; None if it has hardly any."""
     k = int(rng.integers(VIEWS))
-    inverse, labels, cosine = (
-        views["inverse"][k] / np.float32(20000.0),
-        views["labels"][k],
-        views["cosine"][k],
-    )
+    inverse = views["inverse"][k] / np.float32(20000.0)
+    labels, cosine = views["labels"][k], views["cosine"][k]
     rows, columns = np.nonzero(labels)
     if len(rows) < 60:
         return None
