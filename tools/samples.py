@@ -14,7 +14,7 @@ from caryatid.config import SensorConfig
 from caryatid.geometry import transforms
 from caryatid.io import read_recording, write_recording
 from caryatid.sensing.views import SUPPORT_LABEL
-from caryatid.simulation import GroundTruth, SimulatedCamera, TrueEdge, ground_truth, load_scene, write_truth
+from caryatid.simulation import GroundTruth, SimulatedCamera, ground_truth, load_scene, write_truth
 
 SAMPLES = Path(__file__).parents[1] / "src/caryatid/samples"
 VIEWS = 8
@@ -40,13 +40,8 @@ def main() -> None:
     write_recording(folder, views)
     names = {scene.table: "table"} | {body: f"object{label}" for label, body in scene.object_bodies.items()}
     truth = ground_truth(scene)
-    edges = [
-        replace(edge, supporter=names[edge.supporter], supported=names[edge.supported])
-        for edge in truth.edges
-    ]
-    write_truth(
-        GroundTruth(tuple(names[v] for v in truth.vertices), tuple[TrueEdge, ...](edges)), folder / "gt.json"
-    )
+    edges = (replace(e, supporter=names[e.supporter], supported=names[e.supported]) for e in truth.edges)
+    write_truth(GroundTruth(tuple(names[v] for v in truth.vertices), tuple(edges)), folder / "gt.json")
 
     config = ct.Config()
     model = ct.Scene(replace(config, cloud=replace(config.cloud, voxel=THINNED)))
