@@ -105,7 +105,7 @@ def compare(rows_by_name: Mapping[str, Sequence[Row]], part: bool, console: Cons
     """Compare the ratios with the baseline; returns the exit status.
 
     What is worse is measured again, and the better figure counts: chance makes one worse more easily than
-    better. What could not be measured, for want of a peer, is told and does not fail, unless nothing was.
+    better. What could not be measured, for want of a peer, is reported and does not fail, unless nothing was.
     """
     known = read_baseline(BASELINE)
     found = {m.name: m for rows in rows_by_name.values() for m in measures(rows)}

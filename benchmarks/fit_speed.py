@@ -46,8 +46,8 @@ FASTER = {
     ("cylinder", PYRANSAC3D): 1.0 / 200.0, ("cylinder", CGAL): 2.0, ("box", PYRANSAC3D): 1.0 / 50.0,
     ("box", MINIMAL): 1.0,
 }  # fmt: skip
-"""Largest share of the peer's time that is asked for where we are told the shape, as the peers are; of CGAL's
-cylinders no less error either."""
+"""Maximum time relative to the peer's, where the kind of shape is given, as it is to the peers; for CGAL's
+cylinders also the maximum error."""
 
 
 def measure_fits(kind: Kind, effort: Effort) -> list[Row]:
@@ -164,7 +164,7 @@ def _ours(points: Array, normals: Array, config: FitConfig) -> Fitter:
 
 
 def errors_of(estimate: Estimate, shape: Shape) -> dict[str, float]:
-    """How far off: axis [deg], radius and mean of the extents [mm], volume [%]; NaN where nothing is said."""
+    """How far off: axis [deg], radius and mean of the extents [mm], volume [%]; NaN if unknown."""
     if isinstance(shape, ct.Box):
         extents = np.sort(estimate.get("extents", np.full(3, np.nan)))
         off = float(np.abs(extents - np.sort(shape.extents)).mean())

@@ -191,7 +191,8 @@ def test_the_sphere_is_painted_and_cameras_show_what_they_saw(step, drawn):
     away = np.linalg.norm(painted.points + painted.position - sphere.centre_world, axis=1)
     np.testing.assert_allclose(away, sphere.radius, rtol=1e-2)
     assert nodes["/cameras/1"].image.shape[2] == 3
-    decision = replace(step.decision, why="chosen by hand")
+    moved = transforms.rigid(np.eye(3), (0.0, 0.0, 0.1)) @ step.decision.T_world_camera
+    decision = replace(step.decision, T_world_camera=moved, why="chosen by hand")
     by_hand = replace(step, decision=decision)
     planned = tuple(nodes["/cameras/next"].color)
     assert planned != tuple(drawn(by_hand)["/cameras/next"].color) == BY_HAND

@@ -13,6 +13,7 @@ from caryatid.exploration import RobotPose, Step
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
+from caryatid.planning.decision import Decision
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Cloud, View
@@ -147,7 +148,7 @@ class SceneDrawing:
             layers[f"cameras/{each.index + 1}"] = f"{each.index + 1}", each.view, None, colour
         if decision is not None:
             colour = BY_HAND if decision.why == "chosen by hand" else NEXT
-            layers["cameras/next"] = "next", steps[-1].view, decision.T_world_camera, colour
+            layers["cameras/next"] = "next", steps[-1].view, decision, colour
         with self._server.atomic():
             for name in self._shown.keys() - layers.keys() - {"supports"}:
                 del self._shown[name]
@@ -314,11 +315,11 @@ class SceneDrawing:
         )
         return [self._points("/interest/points", at, colours, 0.02), *rays]
 
-    def _cameras(self, name: str, view: View | None, T_world_next: Array | None, colour: Colour) -> list[Any]:
-        """A view's camera with what it saw, or the camera at the next pose (4, 4)."""
-        T_world_camera = T_world_next
+    def _cameras(self, name: str, view: View | None, following: Decision | None, colour: Colour) -> list[Any]:
+        """A view's camera with what it saw, or the camera at the next view."""
+        T_world_camera = None if following is None else following.T_world_camera
         look: dict[str, Any] = {"variant": "filled", "scale": 0.05}
-        if view is not None and T_world_next is None:
+        if view is not None and following is None:
             T_world_camera = view.T_world_camera
             look = {"image": image_of(view), "format": "jpeg", "variant": "wireframe"}
             look["scale"] = 0.06 if colour == CERTAIN else 0.04
