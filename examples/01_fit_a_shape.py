@@ -1,4 +1,4 @@
-"""Fit a box, a cylinder or a sphere to one object's points, not knowing which of them it is."""
+"""Fit a shape to the points of one object, without knowing whether it is a box, a cylinder or a sphere."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""From one cloud of labelled points to the support graph."""
+"""Infer the support graph from one cloud of labelled points."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""One RGB-D frame without a camera pose: python examples/03_real_frame.py FOLDER (in the BOP format)."""
+"""Infer the support graph of one RGB-D frame without a pose: 03_real_frame.py FOLDER (in the BOP format)."""
 
 import json
 import sys

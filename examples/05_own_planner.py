@@ -1,11 +1,11 @@
 """A planner of your own: any object with `plan(state, rng) -> Decision`.
 
-To use it on the command line as `--planner opposite`, a package offers it as an entry point:
+To use it on the command line as `--planner opposite`, provide it as an entry point of a package:
 
     [project.entry-points."caryatid.planners"]
     opposite = "my_package:OppositePlanner"
 
-`planner_package/` beside this file is such a package.
+`planner_package/`, beside this file, is such a package.
 """
 
 import numpy as np

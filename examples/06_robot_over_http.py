@@ -1,4 +1,4 @@
-"""A robot with software of its own asks a service where to look; here the simulator plays the robot."""
+"""A robot with its own software asks a service for the next best view; here, the robot is simulated."""
 
 import json
 import subprocess

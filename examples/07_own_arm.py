@@ -1,6 +1,6 @@
-"""A robot of your own: an arm with a camera in its hand, known by its kinematics, explores in simulation.
+"""Your own robot: an arm with a camera in its hand, given by its kinematics, explores in simulation.
 
-On the command line, with the map in a file: `caryatid explore clutter --robot arm:arm.npz --out run`.
+On the command line, with its map in a file: `caryatid explore clutter --robot arm:arm.npz --out run`.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Drive a caryatid service from a robot's own software; needs nothing but Python. Copy this file.
+"""Use a caryatid service from a robot's own software. This file needs only Python: copy it.
 
 >>> robot = RobotClient("http://127.0.0.1:8765")
 >>> robot.begin("table", segmentation="auto")

@@ -1,4 +1,4 @@
-"""A planner for caryatid: from above first, then all around."""
+"""A planner for caryatid: first from above, then all around."""
 
 import numpy as np
 
