@@ -1,4 +1,4 @@
-"""Infer the support graph of one RGB-D frame without a pose: 03_real_frame.py FOLDER (in the BOP format)."""
+"""Infer the support graph of one RGB-D frame without a pose: 03_real_frame.py FOLDER (in BOP format)."""
 
 import json
 import sys
