@@ -194,14 +194,9 @@ def even_sample(side: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     Normal-space sampling after Rusinkiewicz and Levoy, Efficient variants of the ICP algorithm, 2001. Of the
     patches, each of one side (P,), it gives ascending indices (M,), no more than `count`.
     """
-    if len(side) <= count:
-        return np.arange(len(side))
     sizes = np.bincount(side)
     # Within a side, the patches come in an order that spreads them evenly for any count.
     spread = np.mod(np.arange(len(side)) * (np.sqrt(5.0) - 1.0) / 2.0, 1.0)
     order = np.lexsort((spread, side))
     turn = np.arange(len(side)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    taken = np.cumsum(np.bincount(turn))
-    last = np.searchsorted(taken, count)
-    rest = count - (taken[last - 1] if last > 0 else 0)
-    return np.sort(np.concatenate([order[turn < last], order[turn == last][:rest]]))
+    return np.sort(order[np.argsort(turn, kind="stable")][:count])
