@@ -318,11 +318,7 @@ def wide_parts(labels: NDArray[np.int32]) -> NDArray[np.bool_]:
     Beyond the image's border, nothing counts for either.
     """
     wide = np.zeros(int(labels.max(initial=0)) + 1, dtype=np.bool_)
-    around = (
-        extreme(labels, size=3, mode="nearest")
-        for extreme in (ndimage.minimum_filter, ndimage.maximum_filter)
-    )
-    wide[labels[np.equal(*around)]] = True
+    wide[labels[ndimage.minimum_filter(labels, 3) == ndimage.maximum_filter(labels, 3)]] = True
     return wide
 
 

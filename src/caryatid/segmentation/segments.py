@@ -138,9 +138,7 @@ def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationCon
     source = np.repeat(np.arange(len(index)), count - 1)
     target, near = neighbour[:, 1:].ravel(), distance[:, 1:].ravel() <= config.reach
     near &= source != target
-    low, high = np.minimum(source, target)[near], np.maximum(source, target)[near]
-    keys = np.unique(low * len(index) + high)
-    edges = np.stack(np.divmod(keys, len(index)), axis=-1)
+    (edges,) = summed(np.sort(np.stack([source[near], target[near]], axis=-1), axis=1))
     labels[index] = convex_parts(points, cloud.normals_world[index], edges, config)
     return labels
 
