@@ -68,7 +68,7 @@ def take_samples(
     the pixel that ends at creases. The smooth planes of `sensing` are unsuitable: they round creases.
 
     Args:
-        view: The view; without a pose, the surface is in the camera frame.
+        view: The view, which has a pose.
         foreground: Its pixels (H, W) above the surface.
         surface: The support surface.
         config: The grid.
@@ -108,8 +108,7 @@ def take_samples(
     K = view.K.copy()
     K[:2, 2] -= corner[::-1]
     K[:2] /= config.stride
-    T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
-    height = surface.height(transforms.transform(T, points))
+    height = surface.height(transforms.transform(view.pose, points))
     rgb = None if view.rgb is None else view.rgb[grid]
     return Samples(grid, places, points, normals, height, depth, rgb, K)
 

@@ -51,7 +51,7 @@ def segment(
     """Cut one view into the parts on the support surface.
 
     Args:
-        view: The view; without a pose, the surface is in the camera frame.
+        view: The view, which has a pose.
         surface: The support surface.
         config: Sampling, sizes and angles.
         clouds: Working range and normals.
@@ -70,8 +70,11 @@ def segment(
     samples = take_samples(view, foreground, surface, config, clouds)
     points, normals = samples.points_camera, samples.normals_camera
     edges, steps = grid_edges(samples.places, points, normals, config.edge_jump)
-    odds = _odds(samples, view, surface) if view.depth.shape[1] >= SMALLEST * config.stride else None
-    borders = None if odds is None else partial(affinity_borders, samples, odds, config.alike)
+    odds = borders = None
+    if view.depth.shape[1] >= SMALLEST * config.stride:
+        up, eye = surface.normal_world @ view.pose[:3, :3], view.pose[None, :3, 3]
+        odds = affinities(samples.depth, samples.rgb, samples.K, up, float(surface.height(eye)[0]))
+        borders = partial(affinity_borders, samples, odds, config.alike)
     part = convex_parts(points, normals, edges, config, steps, borders)
     wide = wide_parts(samples.image(part))
     # Something beside the surface, at its edge or in the room behind, is not an object on it.
@@ -105,13 +108,6 @@ def segment(
         rounds = int(np.sqrt(np.count_nonzero(waiting)))
         _spread_labels(labels[around], np.flatnonzero(waiting), view.depth[around], jump, rounds)
     return labels, apart
-
-
-def _odds(samples: Samples, view: View, surface: SupportSurface) -> Odds:
-    """What the network says of the samples."""
-    T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
-    height = float(surface.height(T[None, :3, 3])[0])
-    return affinities(samples.depth, samples.rgb, samples.K, surface.normal_world @ T[:3, :3], height)
 
 
 def _with_share(part: Labels, own: Mask, least: float) -> Labels:
