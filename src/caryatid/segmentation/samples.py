@@ -15,7 +15,6 @@ from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.clouds import slope_limit
 from caryatid.sensing.views import View
 
-Grid = tuple[slice, slice]
 Labels = NDArray[np.int32]
 
 
@@ -34,7 +33,7 @@ class Samples:
         K: Pinhole matrix (3, 3) of the grid [px].
     """
 
-    grid: Grid
+    grid: tuple[slice, slice]
     places: NDArray[np.bool_]
     points_camera: Array
     normals_camera: Array

@@ -26,13 +26,10 @@ from caryatid.segmentation.lccp import (
     summed,
     wide_parts,
 )
-from caryatid.segmentation.samples import Samples, take_samples
+from caryatid.segmentation.samples import Labels, Samples, take_samples
 from caryatid.segmentation.seams import GAP, Pairs, cut_at_seams, divided, find_seams
-from caryatid.segmentation.support_plane import SupportSurface
+from caryatid.segmentation.support_plane import Mask, SupportSurface
 from caryatid.sensing.views import Cloud, View, depth_behind
-
-Labels = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 
 SMALLEST = 160
 """Minimum number of samples across an image for the network [1]: it was trained on crops of 192."""
@@ -79,10 +76,10 @@ def segment(
     wide = wide_parts(samples.image(part))
     # Something beside the surface, at its edge or in the room behind, is not an object on it.
     over = surface.pixels_over(view, 0.0, np.inf, 0.0)[samples.grid][samples.places]
-    part = number_by_appearance(_with_share(np.where(wide[part], part, 0), over, 0.5) - 1)
+    part = _with_share(np.where(wide[part], part, 0), over, 0.5)
     part, enclosed = merge_insides(samples, part)
     if odds is not None:
-        part = number_by_appearance(_with_share(part, odds[-1][samples.places] > 0.0, 0.5) - 1)
+        part = _with_share(part, odds[-1][samples.places] > 0.0, 0.5)
     uncut, width = samples.image(part), GAP // config.stride
     if view.rgb is not None and samples.rgb is not None:
         least, seam = config.min_area / samples.spacing**2, find_seams(view.rgb, samples.grid)
@@ -92,7 +89,7 @@ def segment(
         part = cut_by_colour(samples.image(part), samples.rgb, least)[samples.places]
     part = merge_occluded(samples, part, config, fit_config, rng)
     # Readings of the surface with a common error exceed the clearance, but not by twice as much.
-    part = number_by_appearance(_with_share(part, samples.height > 2.0 * config.clearance, 0.05) - 1)
+    part = _with_share(part, samples.height > 2.0 * config.clearance, 0.05)
     labels[samples.grid] = image = samples.image(part)
     if view.rgb is not None:
         apart = divided(image, uncut, facing, seam, width)
@@ -111,9 +108,9 @@ def segment(
 
 
 def _with_share(part: Labels, own: Mask, least: float) -> Labels:
-    """Leave out the parts (N,) of samples of which less than a share is among some samples (N,)."""
+    """Number the parts (N,) of samples of which at least a share is among some samples (N,)."""
     share = np.bincount(part, own) / np.maximum(np.bincount(part), 1)
-    return np.where((share >= least)[part], part, np.int32(0))
+    return number_by_appearance(np.where((share >= least)[part], part, 0) - 1)
 
 
 def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationConfig) -> Labels:
