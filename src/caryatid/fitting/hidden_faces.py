@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.fitting.least_squares import CONVERGED, NOISE_FLOOR, levenberg_marquardt, normal_equations
@@ -39,7 +38,7 @@ def close_hidden_faces(
     # error of registration.
     points = points[np.linspace(0, len(points) - 1, min(len(points), 3500)).astype(np.intp)]
     origin = points.mean(axis=0)
-    kind, R, centre, half = Primitives.of([shape]).row(0)
+    kind, axes, centre, half = Primitives.of([shape]).row(0)
     # If no step of least squares was better yet, a shape may still be below the shortest extent.
     points, kept = points - origin, np.stack([centre - origin, np.maximum(half, config.min_extent / 2.0)])
     hidden = ~np.array(seen).reshape(3, 2) & (kind != SPHERE)
@@ -48,39 +47,21 @@ def close_hidden_faces(
         hidden[:2] = hidden[:2].all()
     # Unseen sides are moved out of the way, beyond all noise.
     low, high = 0.05 * hidden.T
-    refined = np.concatenate([R, [kept[0] + R @ ((high - low) / 2.0), kept[1] + (low + high) / 2.0]])
+    refined = np.concatenate([axes, [kept[0] + axes @ ((high - low) / 2.0), kept[1] + (low + high) / 2.0]])
     levenberg_marquardt(kind, refined, points, config.steps, config.min_extent, 0.0, CONVERGED)
-    closed, unsure, information = np.concatenate([R, kept]), np.zeros((3, 2)), np.empty((9, 9))
-    sigma, residual, inliers = _close(kind, refined, hidden, points, config, closed, unsure)
-    normal_equations(kind, refined, points, 2.5 * sigma, information, np.empty(9))
-    information *= len(points) / (config.correlated * sigma**2)
-    uncertainty = deviations(kind, unsure, information, config)
-    found = shape.from_extents(rigid(closed[:3], closed[3] + origin), 2.0 * closed[4])
-    return found, residual, inliers, uncertainty
-
-
-def _close(
-    kind: int, refined: Array, hidden: NDArray[np.bool_], points: Array, config: FitConfig, shape: Array,
-    unsure: Array,
-) -> tuple[float, float, float]:  # fmt: skip
-    """Put each hidden side (3, 2) of a refined shape (5, 3) where points (N, 3) end, or back where it was.
-
-    The shape (5, 3) as it was is replaced by the closed one, unless that is too long; the variances (3, 2)
-    [m²] of the hidden sides are written to. It returns the points' standard deviation and mean distance [m],
-    and the share of inliers.
-    """
     R, middle, half = refined[:3], refined[3].copy(), refined[4]
     distance = np.abs(signed_distances(kind, R, middle, half, points))
     near = distance[distance < config.threshold]
     sigma = max(1.4826 * quantile(near, 0.5), NOISE_FLOOR) if len(near) > 0 else config.threshold
-    own, before, closed = in_frame(R, middle, points), in_frame(R, middle, shape[3:4])[0], half.copy()
+    own, before, closed = in_frame(R, middle, points), in_frame(R, middle, kept[:1])[0], half.copy()
+    unsure = np.zeros((3, 2))
     for axis in range(3):
         ends = [-half[axis], half[axis]]
         for side in np.flatnonzero(hidden[axis]):
             sign = 2.0 * side - 1.0
             end, variance = _end(kind, half, own, axis, sign, sigma, config)
             if variance == np.inf:
-                end, variance = shape[4, axis], config.max_extent**2 / 12.0
+                end, variance = kept[1, axis], config.max_extent**2 / 12.0
                 if kind == BOX or axis == 2:
                     end += sign * before[axis]
             ends[side], unsure[axis, side] = sign * end, variance
@@ -88,11 +69,16 @@ def _close(
         low, high = (ends[0], ends[1] + short) if hidden[axis, 1] else (ends[0] - short, ends[1])
         closed[axis] = (high - low) / 2.0
         middle += R[:, axis] * (high + low) / 2.0
-    if 2.0 * closed.max() <= config.max_extent and len(near) > 0:
-        shape[:3], shape[3], shape[4] = R, middle, closed
-    distance = np.abs(signed_distances(kind, shape[:3], shape[3], shape[4], points))
+    if len(near) == 0 or not 2.0 * closed.max() <= config.max_extent:
+        R, (middle, closed) = axes, kept
+    information = np.empty((9, 9))
+    normal_equations(kind, refined, points, 2.5 * sigma, information, np.empty(9))
+    information *= len(points) / (config.correlated * sigma**2)
+    found = shape.from_extents(rigid(R, middle + origin), 2.0 * closed)
+    distance = np.abs(signed_distances(kind, R, middle, closed, points))
+    residual = float(np.minimum(distance, config.threshold).mean())
     inliers = np.count_nonzero(distance < config.threshold) / len(points)
-    return sigma, float(np.minimum(distance, config.threshold).mean()), inliers
+    return found, residual, inliers, deviations(kind, unsure, information, config)
 
 
 def deviations(kind: int, unsure: Array, information: Array, config: FitConfig) -> Uncertainty:
