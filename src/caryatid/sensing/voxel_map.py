@@ -21,7 +21,7 @@ from caryatid.config import VoxelConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import Primitives, Shape
-from caryatid.geometry.signed_distance import gradient, local
+from caryatid.geometry.signed_distance import signed_distances
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, for_each, inner, kernel
 from caryatid.sensing.views import View
@@ -120,8 +120,7 @@ class VoxelMap:
         low = np.floor((outline.min(axis=0) - self.origin_world) / size).astype(np.intp) - 1
         high = np.floor((outline.max(axis=0) - self.origin_world) / size).astype(np.intp) + 2
         low, high = (np.clip(corner, 0, which.shape) for corner in (low, high))
-        axes = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
-        index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        index = _indices(low, high)
         touched = shape.signed_distance(self.centres_world(index)) < size
         held = np.floor((points_world - self.origin_world) / size).astype(np.intp)
         held = held[((held >= 0) & (held < which.shape)).all(axis=1)]
@@ -155,16 +154,14 @@ class VoxelMap:
         grid = np.zeros(np.maximum(highest - lowest, 0), dtype=np.uint8)
         grid[tuple(self.occupied - lowest[:, None])] = 1
         origin_world = self.origin_world + size * lowest
-        low, high = low - lowest, high - lowest
         for number, shape in enumerate(shapes):
+            index = _indices(low[number], high[number]) - lowest
+            centres = origin_world + size * (index + 0.5)
             if len(shape.parts) > 1:
-                # Kernels do not know parts.
-                axes = [np.arange(a, b) for a, b in zip(low[number], high[number], strict=True)]
-                index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-                inside = shape.signed_distance(origin_world + size * (index + 0.5)) < 0.0
-                grid[tuple(index[inside].T)] = 1
-                high[number] = low[number]
-        for_each(_fill_layer, len(grid), (*arrays, low, high, grid, origin_world, size))
+                distance = shape.signed_distance(centres)
+            else:  # A solid of one part is the box around it, as for kernels.
+                distance = signed_distances(*arrays.row(number), centres)
+            grid[tuple(index[distance < 0.0].T)] = 1
         return Occluders(origin_world, grid, self)
 
     def cut(self, low_world: Array, high_world: Array) -> VoxelMap:
@@ -276,6 +273,11 @@ class Occluders:
         return worth
 
 
+def _indices(low: NDArray[np.intp], high: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Indices (N, 3) of all voxels from one (3,) up to another (3,), which is left out."""
+    return np.argwhere(np.ones(high - low, dtype=np.bool_)) + low
+
+
 def _values_at(grid: NDArray[np.int8], points: Array, origin: Array, size: float) -> NDArray[np.int8]:
     """Values (N,) that the voxels of a grid (X, Y, Z) hold at points (N, 3) [m]; 0 outside."""
     index = np.floor((points - origin) / size).astype(np.intp)
@@ -351,24 +353,6 @@ def _count_marks(share, data):  # type: ignore[no-untyped-def]
         hit, passed = new_hits[n], new_passes[n]
         new_hits[n] = hits[n] + np.uint8((hit > 0) & (hits[n] < 255))
         new_passes[n] = passes[n] + np.uint8((passed > hit) & (passes[n] < 255))
-
-
-@kernel
-def _fill_layer(i, data):  # type: ignore[no-untyped-def]
-    """Mark the voxels of one layer of a grid whose centres are inside a shape, within low ≤ index < high."""
-    kinds, R, centres, half, low, high, grid, origin, size = data
-    centre = np.empty((1, 3))
-    for s in range(len(kinds)):
-        if not low[s, 0] <= i < high[s, 0]:
-            continue
-        centre[0, 0] = origin[0] + (i + 0.5) * size
-        for j in range(low[s, 1], high[s, 1]):
-            centre[0, 1] = origin[1] + (j + 0.5) * size
-            for k in range(low[s, 2], high[s, 2]):
-                centre[0, 2] = origin[2] + (k + 0.5) * size
-                x, y, z = local(R[s], centres[s], centre, 0)
-                if gradient(kinds[s], x, y, z, half[s, 0], half[s, 1], half[s, 2])[0] < 0.0:
-                    grid[i, j, k] = 1
 
 
 @kernel
