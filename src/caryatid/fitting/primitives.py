@@ -36,7 +36,7 @@ class Fit:
         inliers: Share of the points within the threshold [1].
         seen: Which sides (-x, +x, -y, +y, -z, +z of the object) points confirm.
         cost: The cost that model choice compares [m].
-        poor: No shape explains the points within the configured residual.
+        poor: No shape explains the points within the configured residual; for the chosen fit only.
         uncertainty: Its uncertainty, for the chosen fit only.
     """
 
@@ -45,7 +45,7 @@ class Fit:
     inliers: float
     seen: Seen
     cost: float
-    poor: bool
+    poor: bool = False
     uncertainty: Uncertainty | None = None
 
 
@@ -213,8 +213,7 @@ def _ranked(
             found = shapes[number, row]
             shape = kind.from_extents(transforms.rigid(found[:3], found[3] + origin), 2.0 * found[4])
             cost, residual, inliers = score[number, row].tolist()
-            poor = residual > config.max_residual
-            fits.append(Fit(shape, residual, inliers, tuple(seen[number, row].tolist()), cost, poor))
+            fits.append(Fit(shape, residual, inliers, tuple(seen[number, row].tolist()), cost))
     return sorted(fits, key=lambda f: f.cost), points
 
 
