@@ -75,17 +75,13 @@ def cut_at_seams(labels: Labels, normals: Array, seam: Mask, width: int, least: 
         nearest = ndimage.distance_transform_edt(apart, return_distances=False, return_indices=True)
         piece = np.where(own, core[tuple(nearest)], 0)
         pairs, by_seam = _borders(piece, normals, seam, width)
-        group = _groups(pairs[~by_seam], count)
+        joined = pairs[~by_seam]
+        graph = coo_array((np.ones(len(joined)), tuple(joined.T)), shape=(count + 1, count + 1))
+        group = connected_components(graph, directed=False)[1]
         beside = group[pairs[by_seam]]
         for other in np.unique(beside[beside[:, 0] != beside[:, 1]])[1:]:
             result[own & (group[piece] == other)] = result.max() + 1
     return result
-
-
-def _groups(pairs: Pairs, count: int) -> Labels:
-    """Group (C + 1,) of each of C pieces, by pairs (P, 2) that are connected."""
-    graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count + 1, count + 1))
-    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def divided(labels: Labels, uncut: Labels, normals: Array, seam: Mask, width: int) -> Pairs:

@@ -266,7 +266,11 @@ def merge_occluded(
     other's tangent planes, a single shape explains as many samples of both as the shape of each does, and
     that shape fills no space seen empty. Merged parts (N,) of samples get the number of the larger.
     """
-    inverse_depth = _inverse_depth(samples, part > 0)
+    # 1/z [1/m] of the whole view, 0 = no reading; at samples of the parts that of the smoothed points.
+    depth, own, places = samples.depth, part > 0, samples.places.copy()
+    inverse_depth = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0.0)
+    places[places] = own
+    inverse_depth[places] = 1.0 / samples.points_camera[own, 2]
     # Samples are smoothed and hold few outliers.
     quick = replace(fit_config, hypotheses=40, polish=1, max_points=300)
     refused: set[tuple[int, int]] = set()
@@ -298,16 +302,6 @@ def _candidates(
     """Shapes for the samples under one of the masks."""
     points, normals = samples.points_camera[masks[number]], samples.normals_camera[masks[number]]
     return candidates(points, normals, config=config, rng=rngs[number])
-
-
-def _inverse_depth(samples: Samples, own: Mask) -> Array:
-    """1/z (H, W) [1/m] of the whole view, 0 = no reading; smoothed at the parts' samples."""
-    inverse_depth = np.zeros(samples.depth.shape)
-    np.divide(1.0, samples.depth, out=inverse_depth, where=samples.depth > 0.0)
-    places = samples.places.copy()
-    places[places] = own
-    inverse_depth[places] = 1.0 / samples.points_camera[own, 2]
-    return inverse_depth
 
 
 def _hidden_pairs(
