@@ -102,10 +102,12 @@ class Solid(Shape):
         """Build a solid of parts in the world frame."""
         vertices = np.concatenate([p.vertices for p in polytopes])
         centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-        return cls(
-            transforms.rigid(np.eye(3), centre),
-            tuple(_moved(p, transforms.rigid(np.eye(3), -centre)) for p in polytopes),
-        )
+        parts = []
+        for p in polytopes:
+            offsets = p.faces[:, 3] + p.faces[:, :3] @ centre
+            faces = np.column_stack([p.faces[:, :3], offsets])
+            parts.append(replace(p, vertices=p.vertices - centre, faces=faces))
+        return cls(transforms.rigid(np.eye(3), centre), tuple(parts))
 
     @classmethod
     def from_extents(cls, T_world_object: Array, extents: Array) -> Solid:
@@ -263,13 +265,6 @@ def hollowed(part: Polytope, cavity: Sequence[tuple[Array, float]]) -> list[Poly
             return [part]
         rest = before
     return pieces
-
-
-def _moved(polytope: Polytope, T: Array) -> Polytope:
-    vertices = transforms.transform(T, polytope.vertices)
-    normals = polytope.faces[:, :3] @ T[:3, :3].T
-    offsets = polytope.faces[:, 3] - normals @ T[:3, 3]
-    return replace(polytope, vertices=vertices, faces=np.column_stack([normals, offsets]))
 
 
 def _spread(polytope: Polytope, spacing: float) -> tuple[Array, Array]:
