@@ -21,7 +21,6 @@ from caryatid.config import VoxelConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import Primitives, Shape
-from caryatid.geometry.signed_distance import signed_distances
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, for_each, inner, kernel
 from caryatid.sensing.views import View
@@ -144,8 +143,8 @@ class VoxelMap:
 
     def occluders(self, shapes: Sequence[Shape] = ()) -> Occluders:
         """What blocks lines of sight: voxels seen occupied, and all that is inside shapes in the world."""
-        arrays, size = Primitives.of(shapes), self.config.size
-        low, high = ((corner - self.origin_world) / size for corner in arrays.bounds())
+        size, bounds = self.config.size, Primitives.of(shapes).bounds()
+        low, high = ((corner - self.origin_world) / size for corner in bounds)
         low = np.clip(np.floor(low).astype(np.int64), 0, self.hits.shape)
         high = np.clip(np.ceil(high).astype(np.int64), 0, self.hits.shape)
         some, index = (low < high).all(axis=1), self.occupied.T
@@ -154,14 +153,10 @@ class VoxelMap:
         grid = np.zeros(np.maximum(highest - lowest, 0), dtype=np.uint8)
         grid[tuple(self.occupied - lowest[:, None])] = 1
         origin_world = self.origin_world + size * lowest
-        for number, shape in enumerate(shapes):
-            index = _indices(low[number], high[number]) - lowest
-            centres = origin_world + size * (index + 0.5)
-            if len(shape.parts) > 1:
-                distance = shape.signed_distance(centres)
-            else:  # A solid of one part is the box around it, as for kernels.
-                distance = signed_distances(*arrays.row(number), centres)
-            grid[tuple(index[distance < 0.0].T)] = 1
+        for shape, first, end in zip(shapes, low, high, strict=True):
+            index = _indices(first, end) - lowest
+            inside = shape.signed_distance(origin_world + size * (index + 0.5)) < 0.0
+            grid[tuple(index[inside].T)] = 1
         return Occluders(origin_world, grid, self)
 
     def cut(self, low_world: Array, high_world: Array) -> VoxelMap:
