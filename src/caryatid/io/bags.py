@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import RecordingConfig
-from caryatid.errors import CaryatidError, InputError, needs_extra
+from caryatid.errors import InputError, needs_extra
 from caryatid.io import images
 from caryatid.io.datasets import Dataset, OpenOptions
 from caryatid.io.images import BrokenImageError
@@ -249,8 +249,6 @@ def _damage(path: Path) -> Iterator[None]:
     """Turn any exception of the library about damaged data into one sentence."""
     try:
         yield
-    except CaryatidError:
-        raise
     except Exception as error:
         words = " ".join(str(error).split()) or type(error).__name__
         reason = f"rosbags cannot read it ({words if len(words) <= 120 else words[:119] + '…'})"

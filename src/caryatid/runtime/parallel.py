@@ -64,7 +64,10 @@ def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
     call for one index must not change the data of another, so that the result is the same on any number of
     threads. The kernel must not raise.
     """
-    compiled = _compiled(work, data)
+    layout = (work, type(data), *map(_layout, data))
+    if layout not in _kept:
+        _kept[layout] = work.compile((types.int64, numba.typeof(data)))
+    compiled = _kept[layout]
     on_threads(lambda index: compiled(index, data), count)
 
 
@@ -103,13 +106,6 @@ _kept: dict[tuple[Any, ...], Any] = {}
 """Compiled work by kernel and layout of its data; `numba.typeof` takes a quarter of a millisecond."""
 
 
-def _compiled(work: Any, data: tuple[Any, ...]) -> Any:
-    layout = (work, type(data), *map(_layout, data))
-    if layout not in _kept:
-        _kept[layout] = work.compile((types.int64, numba.typeof(data)))
-    return _kept[layout]
-
-
 def _layout(value: object) -> object:
     """What a kernel is compiled for."""
     if isinstance(value, np.ndarray):
@@ -123,6 +119,4 @@ def _threads(process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS, thread_name_prefix="caryatid")
 
 
-@cache
-def _blas() -> ThreadpoolController:
-    return ThreadpoolController()
+_blas = cache(ThreadpoolController)
