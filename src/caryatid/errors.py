@@ -86,13 +86,11 @@ def needs_extra(extra: str, source: str | PathLike[str]) -> Iterator[None]:
 def in_one_line(error: Exception) -> str:
     """Describe an error in one line."""
     match error:
-        case CaryatidError():
-            text = str(error)
         case OSError(filename=str() as name, strerror=str() as reason):
             text = f"{name}: {reason.lower()}"
         case OSError(strerror=str() as reason):
             text = reason.lower()
-        case OSError():
+        case CaryatidError() | OSError():
             text = str(error)
         case MemoryError():
             text = f"out of memory: {error}"
