@@ -187,24 +187,11 @@ def add_scaled(index, data):
     results[index] += factor * numbers[index]
 
 
-@njit
-def add(index, data):
-    numbers, factor, results = data
-    results[index] += factor + numbers[index]
-
-
 @pytest.mark.parametrize("count", [0, 1, 2, 100])
 def test_each_piece_of_work_is_done_once(count):
     numbers, results = np.arange(100.0), np.zeros(100)
     for_each(add_scaled, count, (numbers, 3.0, results))
     np.testing.assert_array_equal(results, np.where(np.arange(100) < count, 3.0 * numbers, 0.0))
-
-
-def test_two_kinds_of_work_on_the_same_data_are_told_apart():
-    numbers, results = np.arange(10.0), np.zeros(10)
-    for work in (add_scaled, add, add_scaled):
-        for_each(work, 10, (numbers, 3.0, results))
-    np.testing.assert_array_equal(results, 7.0 * numbers + 3.0)
 
 
 KEPT = """

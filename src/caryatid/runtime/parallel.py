@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numba
-import numpy as np
-from numba import njit, types
+from numba import njit
 from numba.core.caching import FunctionCache
 from threadpoolctl import ThreadpoolController
 
@@ -64,11 +63,7 @@ def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
     call for one index must not change the data of another, so that the result is the same on any number of
     threads. The kernel must not raise.
     """
-    layout = (work, type(data), *map(_layout, data))
-    if layout not in _kept:
-        _kept[layout] = work.compile((types.int64, numba.typeof(data)))
-    compiled = _kept[layout]
-    on_threads(lambda index: compiled(index, data), count)
+    on_threads(lambda index: work(index, data), count)
 
 
 def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
@@ -101,16 +96,6 @@ def _read_or_forget(self: FunctionCache, signature: Any, context: Any) -> Any:
 
 
 _read_kernel, FunctionCache.load_overload = FunctionCache.load_overload, _read_or_forget
-
-_kept: dict[tuple[Any, ...], Any] = {}
-"""Compiled work by kernel and layout of its data; `numba.typeof` takes a quarter of a millisecond."""
-
-
-def _layout(value: object) -> object:
-    """What a kernel is compiled for."""
-    if isinstance(value, np.ndarray):
-        return value.dtype.str, value.ndim, value.flags.c_contiguous, value.flags.writeable
-    return type(value)
 
 
 @cache
