@@ -74,6 +74,8 @@ def test_views_one_by_one_give_the_graph_of_all_of_them(folder, views, graph_aft
     config = replace(Config(), report=replace(Config().report, image_width=100))
     options = {"segmentation": "labels", "seed": 7, "planner": "random"}
     with Session.begin(folder, config, **options) as session:
+        with pytest.raises(SessionConflictError, match="the next view is 0"):
+            session.add(views[0], number=-1)
         assert session.add(views[0]).number == 0
     for number in (1, 2):
         with Session.open(folder) as session:

@@ -341,7 +341,7 @@ class Session:
         capture = Capture.of(view) if isinstance(view, View) else view
         record = capture.record
         if number is not None and number != self.views:
-            if number != self.views - 1 or record.digest != self._records[-1].digest:
+            if not 0 <= number == self.views - 1 or record.digest != self._records[-1].digest:
                 reason = f"has number {number}, but the next view is {self.views}"
                 raise SessionConflictError(record.name, reason)
             return self._added()
