@@ -39,9 +39,9 @@ class Command:
         self._process.kill()
         self._process.communicate(timeout=60)
 
-    def interrupt(self):
-        """Press Ctrl-C; status, stdout and the last line of stderr."""
-        os.killpg(self._process.pid, signal.SIGINT)
+    def interrupt(self, number=signal.SIGINT):
+        """Press Ctrl-C, or send another signal; status, stdout and the last line of stderr."""
+        os.killpg(self._process.pid, number)
         out, err = self._process.communicate(timeout=60)
         assert "Traceback" not in err
         return self._process.returncode, out, (err.splitlines() or [""])[-1]
@@ -60,14 +60,14 @@ def whole(folder, views):
     return run
 
 
-@pytest.mark.parametrize("moment", ["view 1:", "view 3:"])
-def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment):
+@pytest.mark.parametrize(("moment", "number"), [("view 1:", signal.SIGINT), ("view 3:", signal.SIGTERM)])
+def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment, number):
     folder = tmp_path / "runs" / "run"
     words = ["explore", scene_file, "--out", folder, "--no-early-stop", *SMALL]
     assert run_command(*words, "--views", 1, "--quiet") == 0, "an older run, which gives way to what is kept"
     command = Command(*words, "--views", 50)
     command.wait_for(moment)
-    status, out, told = command.interrupt()
+    status, out, told = command.interrupt(number)
     assert (status, out) == (130, "")
     run = whole(folder, 3 if moment == "view 3:" else 1)
     count = "1 view is" if len(run.views) == 1 else f"{len(run.views)} views are"

@@ -15,7 +15,7 @@ import pytest
 from conftest import SMALL
 from numba import njit
 
-from caryatid.runtime import compiling
+from caryatid.runtime import compiling, parallel
 from caryatid.runtime.compiling import compile_kernels
 from caryatid.runtime.parallel import for_each
 
@@ -130,6 +130,22 @@ def test_ctrl_c_while_compiling_leaves_no_run_and_no_stamp(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
+def test_compilers_end_with_the_process_that_started_them(tmp_path):
+    """Killed in its first compilation, it leaves no process, and the next run takes its folder over."""
+    code = "from caryatid.runtime.compiling import compile_kernels; compile_kernels()"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    process = subprocess.Popen([sys.executable, "-c", code], env=environment)
+    while not list(tmp_path.rglob("*.lock")) or not list(tmp_path.rglob("*.nbi")):
+        time.sleep(0.2)
+        assert process.poll() is None
+    process.kill()
+    process.wait()
+    time.sleep(1.0)
+    listed = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
+    assert str(tmp_path) not in listed
+
+
 @pytest.fixture
 def package(tmp_path, monkeypatch):
     """A package of modules a, b that imports a, and c, each with a kernel; a list of the rehearsals."""
@@ -181,6 +197,14 @@ def test_where_nothing_can_be_compiled_beforehand_nothing_is(package, monkeypatc
 # Sharing work out
 
 
+def test_threads_are_those_that_are_asked_for(monkeypatch):
+    for asked, threads in (("3", 3), ("0", None), ("many", None)):
+        monkeypatch.setenv("CARYATID_THREADS", asked)
+        parallel.cores.cache_clear()
+        assert parallel.cores() == (threads or parallel.cores.__wrapped__())
+    parallel.cores.cache_clear()
+
+
 @njit
 def add_scaled(index, data):
     numbers, factor, results = data
@@ -226,3 +250,15 @@ def test_a_kept_kernel_whose_types_were_renamed_is_compiled_again(tmp_path):
             capture_output=True, text=True, check=False,
         )  # fmt: skip
         assert done.stdout == "[0.0, 1.0, 2.0]", done.stderr
+
+
+@pytest.mark.slow
+def test_a_damaged_kernel_is_compiled_again(tmp_path):
+    names = {}
+    source = tmp_path / "kernel.py"
+    source.write_text("def f(x): return x + 1\n")
+    for damage in (None, ".nbc", ".nbi"):
+        for file in (tmp_path / "__pycache__").glob(f"*{damage}"):
+            file.write_bytes(file.read_bytes()[:-20])
+        exec(compile("def f(x): return x + 1", str(source), "exec"), names)
+        assert njit(cache=True)(names["f"])(1) == 2
