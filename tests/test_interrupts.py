@@ -20,11 +20,11 @@ pytestmark = pytest.mark.slow
 class Command:
     """A command in a process of its own, in which Ctrl-C is what it is in a shell."""
 
-    def __init__(self, *words):
+    def __init__(self, *words, on_interrupt=signal.SIG_DFL):
         self._process = subprocess.Popen(
             [sys.executable, "-m", "caryatid", *map(str, words)],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+            preexec_fn=lambda: signal.signal(signal.SIGINT, on_interrupt),
         )  # fmt: skip
 
     def wait_for(self, text):
@@ -130,13 +130,7 @@ def test_two_interrupts_end_it_too(tmp_path, scene_file):
 def test_a_command_in_the_background_goes_on(tmp_path, scene_file):
     """A shell that starts it with & lets it ignore Ctrl-C, which is meant for another."""
     words = ["explore", scene_file, "--out", tmp_path / "run", "--views", 2, "--no-early-stop", *SMALL]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "caryatid", *map(str, words)], stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
-    )  # fmt: skip
-    assert "masks: simulator" in process.stderr.readline()
-    assert process.stderr.readline().startswith("view 1:")
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
-    assert process.returncode == 0
+    command = Command(*words, on_interrupt=signal.SIG_IGN)
+    command.wait_for("view 1:")
+    assert command.interrupt()[0] == 0
     assert len(read_run(tmp_path / "run").views) == 2
