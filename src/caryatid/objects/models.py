@@ -15,8 +15,7 @@ from scipy.spatial import cKDTree
 
 from caryatid.config import Config, SegmentationConfig
 from caryatid.fitting.primitives import Fit, FitFailure, fit
-from caryatid.geometry import points as kernels
-from caryatid.geometry.points import last_in_voxels, most_central
+from caryatid.geometry.points import last_in_voxels, most_central, rotate, transform
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import UP, Array
 from caryatid.graph import SceneObject, object_id
@@ -129,11 +128,7 @@ class ObjectPoints:
     def relocate(self, label: int, T: Array) -> None:
         """Move the points of an object by T (4, 4)."""
         which = (self._labels == label).astype(np.intp)
-        poses = np.stack([np.eye(4), T])
-        points = kernels.transform(poses, which, self._cloud.points_world)
-        normals = kernels.rotate(poses, which, self._cloud.normals_world)
-        self._cloud = replace(self._cloud, points_world=points, normals_world=normals)
-        self._relabel(self._labels, {label})
+        self._transform(np.stack([np.eye(4), T]), which, {label})
 
     def move(self, T: Mapping[int, Array]) -> set[int]:
         """Move the points of some views, view → (4, 4); returns the labels that have such points."""
@@ -141,11 +136,8 @@ class ObjectPoints:
         if not moving.any():
             return set()
         poses = np.array([T.get(view, np.eye(4)) for view in range(int(self._views.max()) + 1)])
-        points = kernels.transform(poses, self._views, self._cloud.points_world)
-        normals = kernels.rotate(poses, self._views, self._cloud.normals_world)
-        self._cloud = replace(self._cloud, points_world=points, normals_world=normals)
         changed = set(np.unique(self._labels[moving]).tolist())
-        self._relabel(self._labels, changed)
+        self._transform(poses, self._views, changed)
         return changed
 
     def merge(self, old: int, new: int) -> None:
@@ -182,6 +174,13 @@ class ObjectPoints:
 
     def _select(self, rows: NDArray[np.intp]) -> Cloud:
         return replace(self._cloud.select(rows), labels=self._labels[rows])
+
+    def _transform(self, poses: Array, which: NDArray[np.intp], changed: set[int]) -> None:
+        """Move each point by one (N,) of some poses (K, 4, 4); forget what was selected of some labels."""
+        points = transform(poses, which, self._cloud.points_world)
+        normals = rotate(poses, which, self._cloud.normals_world)
+        self._cloud = replace(self._cloud, points_world=points, normals_world=normals)
+        self._relabel(self._labels, changed)
 
     def _reorder(self, rows: NDArray[np.intp], labels: NDArray[np.int32], changed: set[int]) -> None:
         """Keep these rows, in this order, with the labels (N,) of all; forget what was selected of some."""
@@ -222,15 +221,9 @@ class ObjectModels:
     def copy(self) -> ObjectModels:
         """Return an independent copy; clouds, trees and shapes are shared."""
         other = copy.copy(self)
-        other.points = self.points.copy()
-        other.fits = self.fits.copy()
-        other._solids = self._solids.copy()
-        other._compounds = self._compounds.copy()
-        other._undivided = self._undivided.copy()
-        other._segments = self._segments.copy()
-        other._owners = self._owners.copy()
-        other._apart = self._apart.copy()
-        other._distinct = self._distinct.copy()
+        for name, value in vars(self).items():
+            if isinstance(value, ObjectPoints | dict | list | set):
+                setattr(other, name, value.copy())
         return other
 
     def forget(self, labels: set[int]) -> None:
