@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,43 +38,6 @@ ROUND_SHARE = 0.7
 """Share of the normals of a body of revolution that point at its axis or along it [1]."""
 ALIKE = 0.8
 """Cosine of the angle to a face's normal up to which points belong to it [1]; normals err by up to 30°."""
-
-
-class Compound(Protocol):
-    """A surface that could be several primitives."""
-
-    @property
-    def parameters(self) -> int:
-        """Number of its parameters."""
-        ...
-
-    def costs(self, points: Array, normals: Array, noise: float, config: ExplanationConfig) -> Array:
-        """Cost (N,) [nats] of oriented points (N, 3), each on the face that explains it best."""
-        ...
-
-    def free(self, voxels: VoxelMap) -> int:
-        """Number of voxels seen free that it fills."""
-        ...
-
-
-def compounds(
-    points: Array, normals: Array, noise: float, weight: float, thickness: float, config: ExplanationConfig
-) -> Iterator[Compound]:
-    """Fit a body of revolution and open boxes.
-
-    Args:
-        points: (N, 3) [m].
-        normals: Unit normals (N, 3).
-        noise: Standard deviation of the points [m].
-        weight: Independent readings each point stands for [1].
-        thickness: Thickness of walls seen from one side [m].
-        config: The costs of explanations.
-
-    Yields:
-        The compounds worth trying.
-    """
-    yield from _revolutions(points, normals, noise, weight, config)
-    yield from _open_boxes(points, normals, thickness)
 
 
 def box_axes(normals: Array, up: Array) -> list[Array]:
@@ -143,10 +105,18 @@ class Revolution:
         return int(np.count_nonzero(free))
 
 
-def _revolutions(
+def revolutions(
     points: Array, normals: Array, noise: float, weight: float, config: ExplanationConfig
 ) -> Iterator[Revolution]:
-    """Bodies of revolution around each axis worth trying."""
+    """Fit bodies of revolution around each axis worth trying.
+
+    Args:
+        points: (N, 3) [m].
+        normals: Unit normals (N, 3).
+        noise: Standard deviation of the points [m].
+        weight: Independent readings each point stands for [1].
+        config: The costs of explanations.
+    """
     for middle, axis in _axes(points, normals, noise):
         places, facing = _profile(points, normals, middle, axis)
         if np.count_nonzero(np.linalg.norm(facing, axis=1) > ALIKE) < ROUND_SHARE * len(points):
@@ -287,6 +257,10 @@ class OpenBox:
         return sum(free_in_slab(slab, voxels) for slab in self.slabs)
 
 
+Compound = Revolution | OpenBox
+"""A surface that could be several primitives."""
+
+
 def free_in_slab(slab: Box, voxels: VoxelMap) -> int:
     """Number of voxels seen free that a thin box fills, with free ones on either side."""
     axes = [_middles(n) - 0.5 for n in slab.extents / voxels.config.size]
@@ -298,8 +272,11 @@ def free_in_slab(slab: Box, voxels: VoxelMap) -> int:
     return int(np.count_nonzero(free.reshape(3, -1).all(axis=0)))
 
 
-def _open_boxes(points: Array, normals: Array, thickness: float) -> Iterator[OpenBox]:
-    """Boxes along the axes of the points' faces, open where an inside was seen."""
+def open_boxes(points: Array, normals: Array, thickness: float) -> Iterator[OpenBox]:
+    """Fit boxes along the axes of the faces of oriented points (N, 3) [m], open where an inside was seen.
+
+    Walls seen from one side only have a thickness [m].
+    """
     first = normals[np.argmax((normals @ normals[:: max(1, len(normals) // 100)].T > 0.95).sum(axis=1))]
     axes = np.stack(box_axes(normals, first)) if len(normals) else np.zeros((0, 3))
     if len(axes) < 3:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from caryatid.config import Config, ExplanationConfig, FitConfig
 from caryatid.fitting.primitives import candidates, free_inside
 from caryatid.geometry.shapes import Box, Shape
 from caryatid.geometry.transforms import Array
-from caryatid.objects.compounds import Compound, compounds, free_in_slab, shape_costs
+from caryatid.objects.compounds import Compound, free_in_slab, open_boxes, revolutions, shape_costs
 from caryatid.segmentation.segments import PLAIN, colour_shares
 from caryatid.sensing.voxel_map import VoxelMap
 
@@ -157,10 +158,16 @@ def colour_costs(rgb: NDArray[np.uint8], plain: Array, config: ExplanationConfig
 
 
 def best_explanation(
-    shapes: Sequence[Shape | Compound], evidence: Evidence, config: ExplanationConfig
+    shapes: Iterable[Shape | Compound],
+    evidence: Evidence,
+    config: ExplanationConfig,
+    below: float | None = None,
 ) -> Explanation:
-    """Explain points by one of some shapes, or as an irregular object, whichever costs least."""
-    best = Explanation(None, _cost(None, evidence, config))
+    """Explain points by the cheapest of some shapes, if it costs less than `below` [nats].
+
+    Without a limit, it has to cost less than an irregular object.
+    """
+    best = Explanation(None, _cost(None, evidence, config) if below is None else below)
     for shape in shapes:
         cost = _cost(shape, evidence, config, best.cost)
         if cost < best.cost:
@@ -170,15 +177,11 @@ def best_explanation(
 
 def best_compound(evidence: Evidence, config: Config, below: float) -> Explanation:
     """Explain points by the cheapest compound, if any costs less than `below` [nats]."""
-    best, costs = Explanation(None, below), config.explanation
     if len(evidence) < 2 * config.fit.min_points:
-        return best
-    known = evidence.noise, evidence.weight, config.fit.min_extent, costs
-    for compound in compounds(evidence.points, evidence.normals, *known):
-        cost = _cost(compound, evidence, costs, best.cost)
-        if cost < best.cost:
-            best = Explanation(compound, cost)
-    return best
+        return Explanation(None, below)
+    seen, costs = (evidence.points, evidence.normals), config.explanation
+    bodies = revolutions(*seen, evidence.noise, evidence.weight, costs)
+    return best_explanation(chain(bodies, open_boxes(*seen, config.fit.min_extent)), evidence, costs, below)
 
 
 def _cost(
