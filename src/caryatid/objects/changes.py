@@ -12,6 +12,7 @@ from scipy.special import betainc
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Change, ChangeKind, SceneObject
+from caryatid.objects.fusion import extents_ratio
 from caryatid.sensing.views import View
 from caryatid.sensing.voxel_map import FREE, OCCUPIED
 
@@ -222,10 +223,4 @@ def distinct(points_world: Array) -> int:
 
 def alike(a: SceneObject, b: SceneObject) -> bool:
     """Whether two shapes, wherever they are, can be those of one object, by kind and sizes."""
-    if a.shape.kind != b.shape.kind:
-        return False
-    order = [np.argsort(o.shape.extents, kind="stable") for o in (a, b)]
-    unsure = [np.zeros(3) if o.uncertainty is None else 2.0 * o.uncertainty.sizes for o in (a, b)]
-    first, second = (o.shape.extents[rows] for o, rows in zip((a, b), order, strict=True))
-    excess = np.abs(first - second) - np.hypot(*(u[rows] for u, rows in zip(unsure, order, strict=True)))
-    return bool((excess <= SIZE_TOLERANCE * np.minimum(first, second)).all())
+    return a.shape.kind == b.shape.kind and extents_ratio(a, b) <= 1.0 + SIZE_TOLERANCE

@@ -156,28 +156,26 @@ def _difference(known: SceneObject, seen: SceneObject, config: FusionConfig) -> 
     if "support_surface" in (known.role, seen.role):
         return 0.0 if known.role == seen.role else np.inf
     a, b = known.shape, seen.shape
-    (place, sizes), (other_place, other_sizes) = _unsure(known), _unsure(seen)
+    place, other = (np.zeros(3) if o.uncertainty is None else o.uncertainty.position for o in (known, seen))
     reach = max(config.max_distance, float(min(a.extents.min(), b.extents.min())) / 2.0)
-    reach += float(np.hypot(np.linalg.norm(place), np.linalg.norm(other_place)))
+    reach += 2.0 * float(np.hypot(np.linalg.norm(place), np.linalg.norm(other)))
     distance = float(np.linalg.norm(known.centre_world - seen.centre_world)) / reach
     if distance > 1.0:
         return np.inf
-    # Largest ratio of the sorted extents, less what the uncertainty of both fits explains.
-    first, second = np.argsort(a.extents, kind="stable"), np.argsort(b.extents, kind="stable")
-    unsure = np.hypot(sizes[first], other_sizes[second])
-    excess = np.maximum(np.abs(a.extents[first] - b.extents[second]) - unsure, 0.0)
-    ratio = np.max(1.0 + excess / np.minimum(a.extents[first], b.extents[second]))
     kind_differs = a.kind != b.kind
     angle = 0.0 if kind_differs or _is_round(a) else np.degrees(axes_rotation(b, a)[1]) / config.max_angle
-    size = float(np.log(ratio) / np.log(config.max_ratio))
+    size = float(np.log(extents_ratio(known, seen)) / np.log(config.max_ratio))
     total = distance + size + angle + float(kind_differs)
     return total if max(size, angle) <= 1.0 else np.inf
 
 
-def _unsure(o: SceneObject) -> tuple[Array, Array]:
-    """Two standard deviations (3,) [m] of the centre and of the extents; zero if unknown."""
-    known = o.uncertainty
-    return (np.zeros(3),) * 2 if known is None else (2.0 * known.position, 2.0 * known.sizes)
+def extents_ratio(a: SceneObject, b: SceneObject) -> float:
+    """Largest ratio of the sorted extents of two objects, less what the uncertainty of both explains."""
+    order = [np.argsort(o.shape.extents, kind="stable") for o in (a, b)]
+    first, second = (o.shape.extents[rows] for o, rows in zip((a, b), order, strict=True))
+    unsure = [np.zeros(3) if o.uncertainty is None else 2.0 * o.uncertainty.sizes for o in (a, b)]
+    excess = np.abs(first - second) - np.hypot(*(u[rows] for u, rows in zip(unsure, order, strict=True)))
+    return float(np.max(1.0 + np.maximum(excess, 0.0) / np.minimum(first, second)))
 
 
 def _is_round(shape: Shape) -> bool:
