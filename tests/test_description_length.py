@@ -45,7 +45,7 @@ def alone_in(evidence):
 def divided(points, normals):
     """Group of each point, or None where they are one object."""
     evidence = gather(Cloud(points, normals))
-    groups = split(evidence, alone_in(evidence), up=UP, config=CONFIG, rng=np.random.default_rng(0))
+    groups = split(evidence, alone_in(evidence), config=CONFIG, rng=np.random.default_rng(0))
     return None if groups is None else groups[cKDTree(evidence.points).query(points)[1]]
 
 
@@ -88,7 +88,7 @@ def test_points_that_determine_nothing_have_a_finite_cost(spread, count):
     part = Evidence(points, np.tile(UP, (count, 1)), 1.0, 0.003, None)
     assert np.isfinite(alone_in(part).cost)
     whole = best_explanation([STACKED[0]], part, COSTS)
-    groups = split(part, whole, up=UP, config=CONFIG, rng=np.random.default_rng(0))
+    groups = split(part, whole, config=CONFIG, rng=np.random.default_rng(0))
     assert groups is None or len(groups) == count
 
 
@@ -232,7 +232,7 @@ def test_flush_boxes_are_two_where_a_view_showed_each_in_a_colour_of_its_own(lef
     shown = 1 + (whole.points[None, :, 1] < 0.0).astype(np.int32)
     for segments, divided in ((shown, not merged), (None, False)):
         whole = replace(whole, segments=segments)
-        groups = split(whole, alone_in(whole), up=UP, config=CONFIG, rng=rng)
+        groups = split(whole, alone_in(whole), config=CONFIG, rng=rng)
         assert (groups is not None) == divided
 
 
@@ -244,7 +244,7 @@ def test_a_row_of_flush_boxes_is_divided_where_a_view_showed_each_in_a_colour_of
     whole = gather(Cloud(points, normals, rgb=rgb))
     place = np.clip(np.floor(whole.points[:, 1] / 0.06).astype(int) + 2, 0, 3)
     whole = replace(whole, segments=(place[None] + 1).astype(np.int32))
-    groups = split(whole, alone_in(whole), up=UP, config=CONFIG, rng=rng)
+    groups = split(whole, alone_in(whole), config=CONFIG, rng=rng)
     sides = [place == k for k in range(4)]
     assert [np.mean(groups == np.bincount(groups[own]).argmax()) for own in sides] == pytest.approx(
         [own.mean() for own in sides], abs=0.02
@@ -262,7 +262,7 @@ def test_boxes_side_by_side_are_one_object_where_most_views_show_one(views, part
     left, count = evidence.points[:, 0] < 0.03, len(evidence)
     segments = np.array([np.where(left, *labels) for labels in views], dtype=np.int32).reshape(-1, count)
     evidence = replace(evidence, segments=segments)
-    groups = split(evidence, alone_in(evidence), up=UP, config=CONFIG, rng=np.random.default_rng(0))
+    groups = split(evidence, alone_in(evidence), config=CONFIG, rng=np.random.default_rng(0))
     assert (1 if groups is None else len(np.unique(groups))) == parts
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence, Set
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence, Set
 from dataclasses import dataclass, replace
-from functools import cache, partial
 
 import numpy as np
 import scipy.sparse
@@ -14,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from caryatid.config import Config, ExplanationConfig
 from caryatid.geometry.shapes import KINDS, Shape
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.transforms import UP, Array
 from caryatid.objects.compounds import box_axes
 from caryatid.objects.description_length import (
     Evidence,
@@ -35,7 +34,6 @@ from caryatid.segmentation.segments import PLAIN
 
 Groups = NDArray[np.intp]
 Mask = NDArray[np.bool_]
-Hints = Callable[[], Sequence[Mask]]
 Pair = tuple[int, int]
 
 GROWTH = 1.3
@@ -63,7 +61,6 @@ def split(
     evidence: Evidence,
     whole: Explanation,
     *,
-    up: Array,
     config: Config,
     rng: np.random.Generator,
 ) -> Groups | None:
@@ -78,7 +75,6 @@ def split(
     Args:
         evidence: The points of what is taken for one object.
         whole: Its best single explanation.
-        up: Unit vector (3,) upwards.
         config: What is tried, what it costs, and how shapes are fitted.
         rng: Source of the samples.
 
@@ -89,8 +85,8 @@ def split(
         pieces = _separated_pieces(evidence, config)
         if pieces is not None:
             return pieces
-    hints = cache(partial(evidence.shown, config.split.min_points))
-    parts = _parts(evidence, whole, np.arange(len(evidence)), hints, up, config, rng)
+    hints = evidence.shown(config.split.min_points)
+    parts = _parts(evidence, whole, np.arange(len(evidence)), hints, config, rng)
     if parts is None:
         return None
     groups = np.zeros(len(evidence), dtype=np.intp)
@@ -103,8 +99,7 @@ def _parts(
     evidence: Evidence,
     whole: Explanation,
     index: Groups,
-    hints: Hints,
-    up: Array,
+    hints: Sequence[Mask],
     config: Config,
     rng: np.random.Generator,
 ) -> list[tuple[Groups, float]] | None:
@@ -114,13 +109,13 @@ def _parts(
     no shape are not objects.
     """
     own = evidence.select(index)
-    found = _best_two(own, whole, index, hints, up, config, rng)
+    found = _best_two(own, whole, index, hints, config, rng)
     if found is None:
         return None
     parts: list[tuple[Groups, float]] = []
     border = found.cost - sum(e.cost for e in found.explanations)
     for side, explanation in zip((~found.second, found.second), found.explanations, strict=True):
-        further = _parts(evidence, explanation, index[side], hints, up, config, rng)
+        further = _parts(evidence, explanation, index[side], hints, config, rng)
         if not (found.by_colour or further or explained(explanation, own.select(side), config.explanation)):
             return None
         parts += further or [(index[side], explanation.cost)]
@@ -132,8 +127,7 @@ def _best_two(
     evidence: Evidence,
     whole: Explanation,
     index: Groups,
-    hints: Hints,
-    up: Array,
+    hints: Sequence[Mask],
     config: Config,
     rng: np.random.Generator,
 ) -> TwoObjects | None:
@@ -146,24 +140,23 @@ def _best_two(
     misfit = own[near].mean(axis=1)
     excess = float(np.maximum(misfit - costs.usual, 0.0).sum()) * evidence.weight
     free = whole.cost - price(whole.shape, costs) - float(own.sum()) * evidence.weight
-    starts = [h[index] for h in hints()]
+    starts = [h[index] for h in hints]
     starts = [h for h in starts if h.any() and not h.all()]
     hinted = len(starts)
     colours = max((_colours(evidence, start, costs) for start in starts), default=0.0)
     if excess + free + colours < costs.parameter_cost * min(kind.parameters for kind in KINDS.values()):
         return None
-    starts += _hypotheses(evidence, misfit, up, config)
-    looks = _settled(evidence, starts, hinted, near, 0, config, rng, first_look=True)
+    starts += _hypotheses(evidence, misfit, config)
+    looks = _settled(evidence, starts, hinted, near, config, rng, first_look=True)
     # The best two of those with a shape for one side at least are settled with full fits.
-    shaped = [k for k, look in enumerate(looks) if look and any(e.shape for e in look.explanations)]
-    tried = [k for _, k in sorted((look.cost, k) for k, look in enumerate(looks) if look and k in shaped)[:2]]
-    tried.sort()
+    shaped = {k: look.cost for k, look in looks.items() if any(e.shape for e in look.explanations)}
+    tried = sorted(sorted(shaped, key=shaped.__getitem__)[:2])
     hinted = sum(k < hinted for k in tried)
-    settled = _settled(evidence, [starts[k] for k in tried], hinted, near, config.split.rounds, config, rng)
+    settled = _settled(evidence, [starts[k] for k in tried], hinted, near, config, rng)
     better = [
         two
-        for two in settled
-        if two and two.cost < whole.cost and (two.by_colour or not _is_layer(evidence, two))
+        for two in settled.values()
+        if two.cost < whole.cost and (two.by_colour or not _is_layer(evidence, two))
     ]
     return min(better, key=lambda two: two.cost, default=None)
 
@@ -187,19 +180,19 @@ def _settled(
     starts: Sequence[Mask],
     hinted: int,
     near: Groups,
-    rounds: int,
     config: Config,
     rng: np.random.Generator,
     *,
     first_look: bool = False,
-) -> list[TwoObjects | None]:
+) -> dict[int, TwoObjects]:
     """Fit both sides of each start, assign each point to the side that explains it better, and iterate.
 
+    A first look only makes quick fits of the sides as they are.
     Colours count only for the first, `hinted` starts, where a view showed a border between the sides:
     elsewhere a border of colours may be part of a print.
 
     Returns:
-        The division each start converges to; None if one side is left with too few points.
+        The division each start converges to, by its index; none if one side is left with too few points.
     """
 
     def explained_sides(quick: bool) -> list[tuple[int, tuple[Explanation, Explanation]]]:
@@ -217,7 +210,7 @@ def _settled(
         return [(k, (found[2 * n], found[2 * n + 1])) for n, k in enumerate(known)]
 
     seconds = list(starts)
-    for _ in range(rounds):
+    for _ in range(0 if first_look else config.split.rounds):
         for k, pair in explained_sides(quick=True):
             # To the shape that explains a point better, together with the points around it.
             cost = np.stack([point_costs(e.shape, evidence, config.explanation) for e in pair])
@@ -227,7 +220,7 @@ def _settled(
                 cost = cost * evidence.weight + colours
             cost = (cost + cost[:, near].mean(axis=2)) / 2.0
             seconds[k] = _connected(evidence.points, cost[1] < cost[0])
-    settled: list[TwoObjects | None] = [None] * len(starts)
+    settled: dict[int, TwoObjects] = {}
     for k, pair in explained_sides(first_look):
         two = _two(evidence, seconds[k], pair, near, config)
         gain = _colours(evidence, seconds[k], config.explanation) if k < hinted else 0.0
@@ -237,7 +230,7 @@ def _settled(
     return settled
 
 
-def _hypotheses(evidence: Evidence, misfit: Array, up: Array, config: Config) -> Iterator[Mask]:
+def _hypotheses(evidence: Evidence, misfit: Array, config: Config) -> Iterator[Mask]:
     """Masks (N,) of points that may be one object: poorly explained patches, and sides of cuts."""
     poor = misfit > config.explanation.irregular
     if poor.any():
@@ -247,7 +240,7 @@ def _hypotheses(evidence: Evidence, misfit: Array, up: Array, config: Config) ->
             start[np.flatnonzero(poor)[part == number]] = True
             yield start
     shares = np.linspace(0.0, 1.0, config.split.cuts + 2)[1:-1]
-    for direction in box_axes(evidence.normals, up):
+    for direction in box_axes(evidence.normals, UP):
         height = evidence.points @ direction
         for level in np.quantile(height, shares):
             yield height > level

@@ -17,7 +17,7 @@ from caryatid.config import Config, SegmentationConfig
 from caryatid.fitting.primitives import Fit, FitFailure, fit
 from caryatid.geometry.points import last_in_voxels, most_central, rotate, transform
 from caryatid.geometry.shapes import Primitives, Shape
-from caryatid.geometry.transforms import UP, Array
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, object_id
 from caryatid.objects.compounds import Compound
 from caryatid.objects.description_length import (
@@ -377,13 +377,8 @@ class ObjectModels:
             if len(cloud) < GROWTH * self._undivided.get(label, 0):
                 continue
             evidence, whole = self._explained(label, noise, voxels)
-            groups = split(
-                evidence,
-                whole,
-                up=UP,
-                config=self._config,
-                rng=np.random.default_rng([self._seed, label]),
-            )
+            rng = np.random.default_rng([self._seed, label])
+            groups = split(evidence, whole, config=self._config, rng=rng)
             if groups is None:
                 self._undivided[label] = len(cloud)
             else:
