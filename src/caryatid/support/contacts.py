@@ -90,33 +90,8 @@ def find_contacts(shapes: Sequence[Shape], margin: float) -> list[Contact]:
     ]
 
 
-def local_frames(
-    shapes: Primitives, pairs: NDArray[np.intp], points_world: Array, normals_world: Array
-) -> tuple[Array, Array]:
-    """Contacts in the frames of their two shapes.
-
-    Args:
-        shapes: N shapes.
-        pairs: Indices (K, 2) of the two shapes of each contact.
-        points_world: Centre of each contact (K, 3) [m].
-        normals_world: Normal (K, 3) of each, from the first shape to the second.
-
-    Returns:
-        Centres (K, 2, 3) [m], and the directions (K, 2, 3) out of either shape.
-    """
-    R = shapes.R[pairs]
-    points = np.einsum("kpij,kpi->kpj", R, points_world[:, None] - shapes.centres[pairs])
-    outward_world = np.stack([normals_world, -normals_world], axis=1)
-    return points, np.einsum("kpij,kpi->kpj", R, outward_world)
-
-
 def find_gap(a: Shape, b: Shape) -> float:
-    """Distance [m] between two shapes at any range; negative if they overlap.
-
-    Args:
-        a: One shape.
-        b: The other shape.
-    """
+    """Distance [m] between two shapes at any range; negative if they overlap."""
     parts, count = [*a.parts, *b.parts], len(a.parts)
     data = _collide(parts, np.arange(len(parts)), 0.0)
     apart = float(np.linalg.norm(a.T_world_object[:3, 3] - b.T_world_object[:3, 3]))

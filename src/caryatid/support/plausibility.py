@@ -14,7 +14,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject
-from caryatid.support.contacts import Contact, find_contacts, local_frames
+from caryatid.support.contacts import Contact, find_contacts
 
 
 def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> list[SceneObject]:
@@ -72,11 +72,7 @@ def drawn(o: SceneObject, rng: np.random.Generator, config: PlausibilityConfig) 
 
 @cache
 def effect(ties: tuple[int, int, int]) -> Array:
-    """Effect of each independent variable (9,) on translation, rotation and half extents (9, 9).
-
-    Args:
-        ties: Which extents of the shape are one number.
-    """
+    """Effect of a shape's independent variables (9,) on translation, rotation and half extents (9, 9)."""
     matrix = np.zeros((9, 9))
     matrix[3:6, 3:6] = np.eye(3)
     for axis, round_ in enumerate(_round(ties)):
@@ -99,8 +95,7 @@ def _round(ties: tuple[int, int, int]) -> list[bool]:
 def deviations(o: SceneObject) -> Array:
     """Standard deviation of each of an object's independent variables (9,); zero where it cannot change.
 
-    Args:
-        o: An object; the support surface, and objects without `uncertainty`, cannot change.
+    The support surface, and objects without `uncertainty`, cannot change.
     """
     sigma = np.zeros(9)
     if (known := o.uncertainty) is None or o.role == "support_surface":
@@ -128,17 +123,14 @@ def _floating(
 
 
 def gap_rows(objects: Sequence[SceneObject], contacts: Sequence[Contact], pairs: NDArray[np.intp]) -> Array:
-    """How far (K, 2, 9) each variable of the two objects of a contact closes its gap.
-
-    Args:
-        objects: All of them.
-        contacts: K contacts.
-        pairs: Indices (K, 2) of the two objects of each.
-    """
+    """How far (K, 2, 9) each variable of the two objects (K, 2) of each contact closes its gap."""
     points_world = np.array([c.point_world for c in contacts]).reshape(-1, 3)
     normals_world = np.array([c.normal_world for c in contacts]).reshape(-1, 3)
     shapes = [o.shape for o in objects]
-    p, u = local_frames(Primitives.of(shapes), pairs, points_world, normals_world)
+    _, R, centres, _ = Primitives.of(shapes)
+    # Contacts in the frames of their two shapes: centres, and directions out of either shape.
+    p = np.einsum("kpij,kpi->kpj", R[pairs], points_world[:, None] - centres[pairs])
+    u = np.einsum("kpij,kpi->kpj", R[pairs], np.stack([normals_world, -normals_world], axis=1))
     round_ = np.array([_round(s.ties) for s in shapes]).reshape(-1, 3)[pairs]
     sizes = np.where(round_, 0.0, np.abs(u))
     sizes[..., 0] += np.linalg.norm(np.where(round_, u, 0.0), axis=-1)

@@ -12,11 +12,10 @@ from caryatid.config import SupportConfig
 from caryatid.geometry import polygons
 from caryatid.geometry.shapes import Box, Shape
 from caryatid.geometry.solids import Solid
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.transforms import UP, Array
 from caryatid.graph import Stability
 from caryatid.support.contacts import Contact
 
-_UP = np.array([0.0, 0.0, 1.0])
 _NO_AREA = 1e-12
 """Smaller contact areas are lines and points, blurred by rounding [m²]; a micrometre squared."""
 _STEEP = 0.1
@@ -36,7 +35,7 @@ def ground_outline(shape: Shape) -> Array:
     """P_A: the polygon (M, 2) [m] the shape's extent projects to on the ground."""
     if isinstance(shape, Solid):
         return polygons.hull(_outline(shape))
-    return _cap(shape, _UP, np.inf)
+    return _cap(shape, UP, np.inf)
 
 
 def contact_patch(
