@@ -43,20 +43,23 @@ class PaperPlanner:
         ends = np.array([p.direction for p in added]).reshape(-1, 3)
         eyes_world = state.sphere.centre_world + state.sphere.radius * ends
         hidden = np.diag(hidden_from(eyes_world, added, state.voxels))
-        saliency, strongest = _saliency(added, hidden, state.visited, state.candidates.directions, config)
+        directions = state.candidates.directions
 
         def why(best: int) -> str:
-            if strongest[best] < 0:
+            given = painted(added, directions, float(np.deg2rad(config.spread)))[best]
+            raised = np.where(hidden, 0.0, given)
+            if raised.max(initial=0.0) <= 0.0:
                 return "no point of interest is reachable; the nearest new view"
-            return added[strongest[best]].why
+            return added[raised.argmax()].why
 
+        saliency = partial(_saliency, added, hidden, state.visited, config)
         return decide(
             state.candidates,
-            saliency,
+            saliency(directions),
             path_cost(state),
             why,
             points=tuple(points),
-            elsewhere=partial(_on_sphere, added, hidden, state.visited, state.sphere.directions, config),
+            elsewhere=partial(saliency, state.sphere.directions),
         )
 
 
@@ -80,30 +83,15 @@ def _reachable(direction: Array, state: PlanningState) -> bool:
     return bool(angle <= np.sqrt(4.0 * np.pi / len(state.sphere.directions)))
 
 
-def _on_sphere(
-    points: list[PointOfInterest],
-    hidden: NDArray[np.bool_],
-    visited: Array,
-    directions: Array,
-    config: ActiveVisionConfig,
-) -> Array:
-    """Saliency (M,) of all directions (M, 3); a picklable function, because most never draw it."""
-    return _saliency(points, hidden, visited, directions, config)[0]
-
-
 def _saliency(
     points: list[PointOfInterest],
     hidden: NDArray[np.bool_],
     visited: Array,
-    directions: Array,
     config: ActiveVisionConfig,
-) -> tuple[Array, NDArray[np.intp]]:
-    """Saliency (M,) of views in directions (M, 3), and the point it comes from (M,); −1 for none."""
+    directions: Array,
+) -> Array:
+    """Saliency (M,) of views in directions (M, 3)."""
     given = painted(points, directions, float(np.deg2rad(config.spread)))
-    raised = np.where(hidden, 0.0, given)
+    raised = np.where(hidden, 0.0, given).max(axis=1, initial=0.0)
     lowered = np.where(hidden, given, 0.0).max(axis=1, initial=0.0)
-    saliency = raised.max(axis=1, initial=0.0)
-    strongest = raised.argmax(axis=1) if raised.shape[1] else np.full(len(directions), -1)
-    strongest = np.where(saliency > 0.0, strongest, -1)
-    inhibited = inhibition_of_return(visited, directions, config)
-    return saliency + np.minimum(-lowered, inhibited), strongest
+    return raised + np.minimum(-lowered, inhibition_of_return(visited, directions, config))

@@ -40,16 +40,16 @@ class AttentionPlanner:
         hidden = None
         if points and config.occlusion != "ignore":
             hidden = hidden_from(state.candidates.T_world_camera[:, :3, 3], points, state.voxels).T
-        saliency, strongest = _largest(points, directions, config, hidden)
+        given = _given(points, directions, config, hidden)
 
         def why(best: int) -> str:
-            if strongest[best] < 0:
+            if given[best].max(initial=-np.inf) == -np.inf:
                 return "no point of interest is left; the nearest new view"
-            return points[strongest[best]].why
+            return points[given[best].argmax()].why
 
         return decide(
             state.candidates,
-            saliency + inhibition_of_return(visited, directions, config),
+            _largest(given) + inhibition_of_return(visited, directions, config),
             path_cost(state),
             why,
             points=tuple(points),
@@ -61,31 +61,32 @@ def _on_sphere(
     points: Sequence[PointOfInterest], visited: Array, directions: Array, config: ActiveVisionConfig
 ) -> Array:
     """Saliency (M,) of views without a test whether points are hidden from them."""
-    return _largest(points, directions, config)[0] + inhibition_of_return(visited, directions, config)
+    return _largest(_given(points, directions, config)) + inhibition_of_return(visited, directions, config)
 
 
-def _largest(
+def _given(
     points: Sequence[PointOfInterest],
     directions: Array,
     config: ActiveVisionConfig,
     hidden: NDArray[np.bool_] | None = None,
-) -> tuple[Array, NDArray[np.intp]]:
-    """Largest saliency (M,) that reaches each view, 0 where none does, and whose it is (M,), −1 for none.
+) -> Array:
+    """Saliency (M, K) that points give views in directions (M, 3), −∞ where none reaches.
 
     A point reaches all views, or its nearest one alone where saliency does not spread. `hidden` says which
     points are hidden from which views (M, K).
     """
-    if not points:
-        return np.zeros(len(directions)), np.full(len(directions), -1)
     if config.propagation:
         given = painted(points, directions, float(np.deg2rad(config.spread)))
     else:
-        tops = np.stack([p.direction for p in points])
+        tops = np.array([p.direction for p in points]).reshape(-1, 3)
         given = np.full((len(directions), len(points)), np.nan)
         given[np.argmax(directions @ tops.T, axis=0), np.arange(len(points))] = [p.saliency for p in points]
     if hidden is not None:
         given = np.where(hidden, -given, given)
-    counted = np.where(np.isnan(given), -np.inf, given)
-    largest = counted.max(axis=1)
-    strongest = np.where(largest > -np.inf, counted.argmax(axis=1), -1)
-    return np.where(strongest < 0, 0.0, largest), strongest
+    return np.where(np.isnan(given), -np.inf, given)
+
+
+def _largest(given: Array) -> Array:
+    """Largest saliency (M,) among those that reach each view (M, K); 0 where none does."""
+    largest = given.max(axis=1, initial=-np.inf)
+    return np.where(largest > -np.inf, largest, 0.0)
