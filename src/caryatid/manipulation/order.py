@@ -28,7 +28,6 @@ from scipy.sparse.csgraph import connected_components
 from caryatid.config import Config, LiftConfig
 from caryatid.errors import InputError
 from caryatid.geometry.shapes import Primitives, Shape
-from caryatid.geometry.transforms import Array
 from caryatid.graph import Grasp, SceneObject, SupportGraph, TakeStep
 from caryatid.manipulation.grasps import Blocked, find_grasp
 from caryatid.robots.arm import Reachable
@@ -370,7 +369,11 @@ def _groups(shapes: Sequence[Shape], gap: float) -> NDArray[np.int32]:
 
 
 class _DrawnScene:
-    """The table and a group of bodies at rest, and what is left of them."""
+    """The table and a group of bodies at rest, and what is left of them.
+
+    Bodies that move too far before they rest are put back and held, until no others do. They are watched for
+    as long as the highest lift takes, so that no lift is blamed for what moves by itself.
+    """
 
     def __init__(self, table: SceneObject | None, bodies: Mapping[str, Body], config: LiftConfig) -> None:
         self._ids, self._config = list(bodies), config
@@ -381,7 +384,14 @@ class _DrawnScene:
             _add_table(spec, table)
         for name, body in bodies.items():
             add_body(spec, name, body)
-        self._lifting, self.unstable, self._state = _settled(spec, self._ids, config)
+        self._lifting = Lifting(spec, self._ids)
+        seen, seconds = self._lifting.start, self._lifting.longest(self._lifting.start, config)
+        self.unstable, moved = np.zeros(len(bodies), dtype=np.bool_), np.ones(len(bodies), dtype=np.bool_)
+        while moved.any():
+            state = self._lifting.rest(seen, np.flatnonzero(self.unstable).tolist(), seconds, config)
+            moved = strayed(seen, state, config.moved, config.turned) & ~self.unstable
+            self.unstable |= moved
+        self._state = np.where(self.unstable[:, None], seen, state)
 
     def lift(self, object_id: str, hold: Collection[str]) -> Lift:
         """Lift an object while others are held, and those that do not stay in place."""
@@ -424,22 +434,3 @@ def _add_table(spec: Any, table: SceneObject) -> None:
     half = extents / 2.0 + np.where(np.arange(3) == up, 0.0, 0.1)
     body = spec.worldbody.add_body(name=TABLE, pos=T[:3, 3], quat=quaternion(T[:3, :3]))
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, friction=[0.1, 0.005, 0.001])
-
-
-def _settled(spec: Any, ids: Sequence[str], config: LiftConfig) -> tuple[Lifting, NDArray[np.bool_], Array]:
-    """Let a scene come to rest: objects that move too far are put back and held, until no others do.
-
-    It is watched for as long as the highest lift takes, so that no lift is blamed for what moves by itself.
-
-    Returns:
-        The scene, which objects (N,) had to be held, and the state (N, 7) of all.
-    """
-    lifting = Lifting(spec, ids)
-    seen, unstable = lifting.start, np.zeros(len(ids), dtype=np.bool_)
-    seconds = lifting.longest(seen, config)
-    while True:
-        state = lifting.rest(seen, np.flatnonzero(unstable).tolist(), seconds, config)
-        moved = strayed(seen, state, config.moved, config.turned) & ~unstable
-        if not moved.any():
-            return lifting, unstable, np.where(unstable[:, None], seen, state)
-        unstable |= moved
