@@ -92,12 +92,7 @@ class SimulatedHands:
         return bodies_of(graph, true_scene_from_simulation(self.scene, GroundTruth(tuple(self.left), ())))
 
     def take(self, step: TakeStep, bodies: Mapping[str, str]) -> Taken:
-        """Carry out a step, even if it disturbs others.
-
-        Args:
-            step: The step to carry out.
-            bodies: Body that each extracted object represents, by id.
-        """
+        """Carry out a step, even if it disturbs others; extracted objects represent these bodies, by id."""
         body, left = bodies.get(step.object_id), self.left
         held = tuple(bodies[i] for i in step.hold if bodies.get(i) in left)
         if body not in left:

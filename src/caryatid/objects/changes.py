@@ -56,14 +56,9 @@ class ChangeDetector:
         return other
 
     def missing(self, view: View, surfaces: Mapping[str, tuple[Array, Array]]) -> dict[str, str]:
-        """Find objects whose last known place views look through.
+        """Find objects whose last known place views up to this one look through: their ids, with the reason.
 
-        Args:
-            view: The newest view.
-            surfaces: Points and outward normals (N, 3) of each object.
-
-        Returns:
-            Ids of these objects, each with the reason.
+        Surfaces are points and outward normals (N, 3) of each object.
         """
         sight, missing = Sight(view), dict[str, str]()
         odds, self._odds = self._odds, {}
@@ -151,11 +146,7 @@ def appeared(
 
 
 class Sight:
-    """What a view shows at known points.
-
-    Args:
-        view: A view with a pose.
-    """
+    """What a view, which has a pose, shows at known points."""
 
     def __init__(self, view: View) -> None:
         self._view = view
@@ -168,12 +159,9 @@ class Sight:
     def cells(self, points_world: Array, normals_world: Array) -> tuple[int, int]:
         """Number of cells of a surface that the view looks through, and that it confirms.
 
-        A point is looked through if its reading and all around it lie behind it, and confirmed if its own is
-        at its depth. It does not count without a reading, with one in front of it, or if it is turned away.
-
-        Args:
-            points_world: (N, 3) [m].
-            normals_world: Outward unit normals (N, 3).
+        A point (N, 3) [m] with an outward unit normal (N, 3) is looked through if its reading and all around
+        it lie behind it, and confirmed if its own is at its depth. It does not count without a reading, with
+        one in front of it, or if it is turned away.
         """
         points = transforms.transform(self._T_camera_world, points_world)
         normals = normals_world @ self._T_camera_world[:3, :3].T

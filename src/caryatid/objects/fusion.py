@@ -51,11 +51,9 @@ def fuse(
 
 
 def renamed(graph: SupportGraph, names: Mapping[str, str]) -> SupportGraph:
-    """Return a graph in which objects have other ids; of two with the same new id, one stays.
+    """Return a graph of one view with other names, old id → new id; of two with the same new id, one stays.
 
-    Args:
-        graph: Of one view.
-        names: Old id → new id; a support between two equal ids is dropped.
+    A support between two equal ids is dropped.
     """
     objects: dict[str, SceneObject] = {}
     for o in graph.objects:
@@ -220,10 +218,8 @@ def merged_sightings(sightings: Sequence[SceneObject]) -> SceneObject:
 
     The kind is the one with the most evidence; among solids, the best one is used as it is. Poses and radii
     are averaged with the evidence as weight. Each side is averaged over the sightings that saw it, or lies
-    farthest out if none did. Apart from rounding, the result does not depend on the order of the sightings.
-
-    Args:
-        sightings: At least one; id, label and role are those of the first.
+    farthest out if none did. Apart from rounding, the result does not depend on the order of the sightings,
+    except that id, label and role are those of the first.
     """
     # The number of seen sides, or little if there are none; half of it at a residual of 1 cm.
     weights = [(0.1 + sum(o.seen)) / (1.0 + (o.residual / 0.01) ** 2) for o in sightings]

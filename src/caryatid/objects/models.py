@@ -102,11 +102,9 @@ class ObjectPoints:
         return self._select(np.argsort(self._labels, kind="stable"))
 
     def bound(self, voxels: Mapping[int, float], depth: int) -> None:
-        """Leave objects the newest points in each voxel where more than twice `depth` views show them.
+        """Leave objects that more than twice `depth` views show the newest `depth` points in each voxel.
 
-        Args:
-            voxels: Objects and the edge lengths of their voxels [m].
-            depth: Number of points left in a voxel [1].
+        `voxels` are the objects and the edge lengths of their voxels [m].
         """
         if self._views.max(initial=0) < 2 * depth:
             return
@@ -147,11 +145,7 @@ class ObjectPoints:
         self._reorder(order, np.where(self._labels == old, np.int32(new), self._labels), {old, new})
 
     def divide(self, label: int, groups: NDArray[np.intp]) -> list[int]:
-        """Make several objects of one.
-
-        Args:
-            label: Which.
-            groups: Group (N,), from 0, of each point of `of(label)`.
+        """Make an object of each group (N,), from 0, of the points of `of(label)`.
 
         Returns:
             Label of each group; the first keeps the old one.
@@ -352,9 +346,7 @@ class ObjectModels:
     def fit_newest(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
         """Fit objects to the newest view's points alone, and forget all other fits (`sg`).
 
-        Args:
-            labels: Objects this view shows.
-            voxels: Space this view sees free, which no shape may fill.
+        Shapes fill no space that this view sees free.
         """
         self.fits, self._compounds = {}, {}
         self._fit(labels, self.points.newest, voxels)
@@ -364,11 +356,10 @@ class ObjectModels:
         self._fit(labels, partial(self.points.of, edge=self._config.cloud.voxel), voxels)
 
     def divide(self, labels: set[int], voxels: VoxelMap | None = None) -> set[int]:
-        """Split objects that several shapes explain better than one; returns the labels that changed.
+        """Split objects with new points that several shapes explain better than one.
 
-        Args:
-            labels: Objects whose points have changed.
-            voxels: Space seen free, which no shape may fill.
+        Returns:
+            The labels that changed.
         """
         changed: set[int] = set()
         noise = self._noise()
@@ -389,11 +380,7 @@ class ObjectModels:
         return changed
 
     def unite(self, labels: set[int], voxels: VoxelMap | None = None) -> dict[int, int]:
-        """Merge neighbours that one shape explains better than two.
-
-        Args:
-            labels: Objects whose points have changed.
-            voxels: Space seen free, which no shape may fill.
+        """Merge objects with new points and neighbours that one shape explains better than two.
 
         Returns:
             Label given up → label that takes its points.
@@ -426,14 +413,10 @@ class ObjectModels:
         return observation.with_labels(changed)
 
     def form(self, labels: set[int], voxels: VoxelMap | None, table: Array) -> None:
-        """Replace primitives by solids where the points cost less without any primitive.
+        """Replace primitives of objects with new points by solids where these cost less without a primitive.
 
-        A primitive does not explain points of other objects, or of the support surface, inside it.
-
-        Args:
-            labels: Objects whose points have changed.
-            voxels: Space seen free.
-            table: Points (M, 3) [m] of the support surface below the objects.
+        A primitive does not explain points of other objects, or of the support surface below them (M, 3) [m],
+        inside it.
         """
         noise, config = self._noise(), self._config.explanation
         changed = sorted(labels & self.fits.keys())

@@ -139,13 +139,9 @@ class Balance:
 
 
 def touching(objects: Sequence[SceneObject], margin: float) -> list[Contact]:
-    """Find the contacts of a scene; those with the support surface have its normal.
+    """Find the contacts of a scene up to a gap [m]; those with the support surface have its normal.
 
     Where a third object fills the gap, there is none: the floor of a tray parts its content from the table.
-
-    Args:
-        objects: The support surface and the objects.
-        margin: Largest gap [m].
     """
     shapes = [o.shape for o in objects]
     low, high = Primitives.of(shapes).bounds()
@@ -220,9 +216,6 @@ class Equilibrium:
         normal within the friction cone around the vertical, is closed with the probability that its gap
         implies; before that, no gap is as likely as any gap up to `reach`. Closed gaps correct all shapes, as
         in `reconcile`. Gaps into which objects fall or tip in the first draw are closed in all.
-
-        Args:
-            rng: Source of the draws.
         """
         config, count = self._config, len(self.contacts)
         sigma = np.array([deviations(o) for o in self._objects]).reshape(-1, 9)
@@ -279,12 +272,7 @@ class Equilibrium:
         return far, pressed & (draw.gaps > self._config.at_rest * self._fall)
 
     def solve(self, draw: Draw, without: int | None = None) -> Balance:
-        """Find the forces that hold a draw, and the objects that still move.
-
-        Args:
-            draw: The scene.
-            without: Index of an object to remove.
-        """
+        """Find the forces that hold a draw, without the object of an index, and what still moves."""
         model, data, count = self._model, self._data, len(self._objects)
         self._set(draw)
         apart = np.isinf(draw.gaps)

@@ -49,9 +49,9 @@ class SupportPlanner:
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
         """Choose the candidate with the largest c = s − h, eq. 3; the first of equal ones.
 
-        s is the worth of what a candidate shows for the first time, h the cost of going there,
-        `config.effort` times that
-        of eq. 3, and so is the inhibition of return: both only decide where views show about as much.
+        s is the worth of what a candidate shows for the first time. The cost h of going there is
+        `config.effort` times that of eq. 3, and so is the inhibition of return: both only decide where views
+        show about as much.
         """
         check_candidates(state)
         config, sphere, candidates = state.config, state.sphere, state.candidates
