@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence, Set
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import scipy.sparse
@@ -318,17 +319,14 @@ def best_merge(
     low, high = (np.array([f(e.points, axis=0) for e in evidence]).reshape(-1, 3) for f in (np.min, np.max))
     between = np.maximum(np.maximum(low[:, None] - high, low - high[:, None]), 0.0)
     near = np.triu(np.linalg.norm(between, axis=-1) <= gaps, 1)
-    trees: dict[int, cKDTree] = {}
+    tree = cache(lambda k: cKDTree(evidence[k].points))
     pairs = []
     for first, second in np.argwhere(near).tolist():
         a, b = labels[first], labels[second]
         grown = len(evidence[first]) + len(evidence[second]) >= GROWTH * apart.get((a, b), 0)
         if not grown or not {a, b} & changed or frozenset((a, b)) in distinct:
             continue
-        for k in (first, second):
-            if k not in trees:
-                trees[k] = cKDTree(evidence[k].points)
-        if trees[first].count_neighbors(trees[second], gaps[first, second]) > 0:
+        if tree(first).count_neighbors(tree(second), gaps[first, second]) > 0:
             pairs.append((a, b))
     sizes = {k: len(known[k][0]) for k in labels}
     best, most = None, 0.0
