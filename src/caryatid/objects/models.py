@@ -53,7 +53,6 @@ class ObjectPoints:
         self._labels = np.zeros(0, dtype=np.int32)
         self._views = np.zeros(0, dtype=np.intp)
         self._selected: dict[tuple[int, float], Cloud] = {}
-        self._rows_of: dict[int, NDArray[np.intp]] | None = None
 
     def copy(self) -> ObjectPoints:
         """Return points that go on growing by themselves; the points so far are shared."""
@@ -89,12 +88,12 @@ class ObjectPoints:
                 cloud = self.of(label)
                 self._selected[label, edge] = cloud.select(thin(cloud.points_world, edge))
             else:
-                self._selected[label, edge] = self._select(self._rows(label))
+                self._selected[label, edge] = self._select(np.flatnonzero(self._labels == label))
         return self._selected[label, edge]
 
     def newest(self, label: int) -> Cloud:
         """Points of an object in the newest view that showed it."""
-        rows = self._rows(label)
+        rows = np.flatnonzero(self._labels == label)
         return self._select(rows[self._views[rows] == self._views[rows[-1]]])
 
     def everything(self) -> Cloud:
@@ -110,7 +109,7 @@ class ObjectPoints:
             return
         kept, changed = np.ones(len(self._labels), dtype=np.bool_), set()
         for label, edge in voxels.items():
-            rows = self._rows(label)
+            rows = np.flatnonzero(self._labels == label)
             if np.count_nonzero(np.bincount(self._views[rows])) > 2 * depth:
                 kept[rows] = False
                 kept[rows[last_in_voxels(self._cloud.points_world[rows], edge, depth)]] = True
@@ -157,15 +156,6 @@ class ObjectPoints:
         self.labels_used = max(self.labels_used, *names)
         return names
 
-    def _rows(self, label: int) -> NDArray[np.intp]:
-        """Rows of the points of an object, ascending."""
-        if self._rows_of is None:
-            order = np.argsort(self._labels, kind="stable")
-            labels, starts = np.unique(self._labels[order], return_index=True)
-            parts = np.split(order, starts[1:]) if len(labels) else []
-            self._rows_of = dict(zip(labels.tolist(), parts, strict=True))
-        return self._rows_of.get(label, np.zeros(0, dtype=np.intp))
-
     def _select(self, rows: NDArray[np.intp]) -> Cloud:
         return replace(self._cloud.select(rows), labels=self._labels[rows])
 
@@ -183,7 +173,7 @@ class ObjectPoints:
 
     def _relabel(self, labels: NDArray[np.int32], changed: set[int]) -> None:
         """Set all points' labels (N,), and forget what was selected of some."""
-        self._labels, self._rows_of = labels, None
+        self._labels = labels
         self._selected = {key: held for key, held in self._selected.items() if key[0] not in changed}
 
 
