@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 
@@ -34,7 +33,7 @@ _EDGES = {
 def ground_outline(shape: Shape) -> Array:
     """P_A: the polygon (M, 2) [m] the shape's extent projects to on the ground."""
     if isinstance(shape, Solid):
-        return polygons.hull(_outline(shape))
+        return polygons.hull(shape.outline())
     return _cap(shape, UP, np.inf)
 
 
@@ -101,16 +100,10 @@ def _cap(shape: Shape, direction_world: Array, depth: float) -> Array:
     if shape.kind == "sphere":
         return polygons.hull(_ball_cap(shape, direction_world, depth))
     if isinstance(shape, Solid):
-        return polygons.cap(_outline(shape), shape.polytopes[0].edges, direction_world, depth)
+        return polygons.cap(shape.outline(), shape.polytopes[0].edges, direction_world, depth)
     if shape.kind not in _EDGES:
         shape = Box(shape.T_world_object, shape.extents)
-    return polygons.cap(_outline(shape), _EDGES[shape.kind], direction_world, depth)
-
-
-@lru_cache(maxsize=128)
-def _outline(shape: Shape) -> Array:
-    """The shape's outline (N, 3) [m], found once for all its contacts."""
-    return shape.outline()
+    return polygons.cap(shape.outline(), _EDGES[shape.kind], direction_world, depth)
 
 
 def _ball_cap(ball: Shape, direction_world: Array, depth: float) -> Array:
