@@ -444,7 +444,7 @@ class Scene(Pictured):
         ):
             check_place(observation.cloud, registration.aligned, self.surface, self.voxels, config)
         self._registration = registration
-        return observation, self._models.move(moves)
+        return observation, self._models.points.move(moves) - {SUPPORT_LABEL}
 
     def _fused_surface(self, observation: Observation) -> SupportSurface:
         """The support surface from the points of all views."""

@@ -278,7 +278,7 @@ def open_boxes(points: Array, normals: Array, thickness: float) -> Iterator[Open
     Walls seen from one side only have a thickness [m].
     """
     first = normals[np.argmax((normals @ normals[:: max(1, len(normals) // 100)].T > 0.95).sum(axis=1))]
-    axes = np.stack(box_axes(normals, first)) if len(normals) else np.zeros((0, 3))
+    axes = np.stack(box_axes(normals, first))
     if len(axes) < 3:
         return
     turned = normals @ axes.T

@@ -40,7 +40,7 @@ def fuse(
     """
     sightings, _ = _by_view(graphs)
     # By label alone, any sighting is enough.
-    known = [_newest(seen) if same_labels else _vertex(seen, config) for seen in sightings.values()]
+    known = [seen[max(seen)] if same_labels else _vertex(seen, config) for seen in sightings.values()]
     names = match(known, list(graph.objects), config, same_labels=same_labels)
     taken = {*sightings, *names.values()}
     for o in graph.objects:
@@ -183,11 +183,7 @@ def _is_round(shape: Shape) -> bool:
 
 
 def _vertex(seen: Mapping[int, SceneObject], config: FusionConfig) -> SceneObject:
-    return merged_sightings([seen[v] for v in sorted(seen)]) if config.method == "sg" else _newest(seen)
-
-
-def _newest(seen: Mapping[int, SceneObject]) -> SceneObject:
-    return seen[max(seen)]
+    return merged_sightings([seen[v] for v in sorted(seen)]) if config.method == "sg" else seen[max(seen)]
 
 
 def _by_view(

@@ -329,10 +329,6 @@ class ObjectModels:
         self.points.bound({label: float(voxels[label]) for label in shown}, config.cloud.depth)
         return shown - {SUPPORT_LABEL}
 
-    def move(self, T: Mapping[int, Array]) -> set[int]:
-        """Move the points of some views (view → (4, 4)); returns the labels of the objects that have some."""
-        return self.points.move(T) - {SUPPORT_LABEL}
-
     def fit_newest(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
         """Fit objects to the newest view's points alone, and forget all other fits (`sg`).
 
