@@ -60,6 +60,7 @@ class RunWriter(StagedFolder):
 
     Attributes:
         past: The run that this one continues, or None.
+        steps: Entries of run.json for each view: its number, its timings [s], angle and path so far.
         more: More entries of run.json.
         files: Further files of the folder: path in it → content.
 
@@ -76,17 +77,13 @@ class RunWriter(StagedFolder):
         self.more: dict[str, Any] = {}
         self.files: dict[str, bytes] = {}
         self._stepwise = stepwise
-        self._views: list[tuple[dict[str, Any], SupportGraph, Mapping[str, Any] | None]] = []
+        self.steps: list[dict[str, Any]] = []
+        self._graph = SupportGraph()
+        self._scores: list[Mapping[str, Any]] = []
         if self.past is not None:
-            told = self.past.record["steps"]
-            self._views = [(t, v.graph, None) for t, v in zip(told, self.past.views, strict=True)]
+            self.steps, self._graph = list(self.past.record["steps"]), self.past.graph
             # Files listed for a view that a kill prevented may be missing.
             self.written |= {name for name in self.past.record["files"] if (self._place / name).exists()}
-
-    @property
-    def steps(self) -> list[dict[str, Any]]:
-        """Entries of run.json for each view: its number, its timings [s], angle and path so far."""
-        return [step for step, _, _ in self._views]
 
     def add(self, step: Step, score: Mapping[str, Any] | None = None) -> None:
         """Write the next view.
@@ -100,7 +97,7 @@ class RunWriter(StagedFolder):
         Raises:
             InputError: Labels exceed 16 bits, or the disk cannot be written.
         """
-        number = len(self._views)
+        number = len(self.steps)
         labels, folder = step.labels, _view_folder(number)
         if labels.size and not 0 <= labels.min() <= labels.max() <= SUPPORT_LABEL:
             reason = f"labels are not all within 0…{SUPPORT_LABEL}"
@@ -114,21 +111,22 @@ class RunWriter(StagedFolder):
         self.write(f"{folder}/view.json", json_text(document).encode())
         self.write(f"{folder}/step.npz", _encoded(step))
         names = ("timings", "angle_travelled", "path_travelled", "stop")
-        told = {"view": step.index} | {name: getattr(step, name) for name in names}
-        self._views.append((told, step.graph, score))
+        self.steps.append({"view": step.index} | {name: getattr(step, name) for name in names})
+        self._graph = step.graph
+        self._scores += [] if score is None else [score]
         if self._stepwise:
             self._finish({"unfinished": True} if step.decision is not None else {})
 
     def __exit__(self, kind: object = BaseException, *error: object) -> None:
         """Write the rest and publish the folder; after an error other than Ctrl-C, remove it."""
-        interrupted = kind is KeyboardInterrupt and len(self._views) > 0
+        interrupted = kind is KeyboardInterrupt and len(self.steps) > 0
         try:
-            if (interrupted or (kind is None and self._views)) and not self._stepwise:
+            if (interrupted or (kind is None and self.steps)) and not self._stepwise:
                 self._finish({"interrupted": True} if interrupted else {})
         finally:
             super().__exit__()
         if interrupted:
-            count = "1 view is" if len(self._views) == 1 else f"{len(self._views)} views are"
+            count = "1 view is" if len(self.steps) == 1 else f"{len(self.steps)} views are"
             remedy = f"`caryatid report {self.folder}` writes the report"
             if self._stepwise:
                 remedy = "run the same command to continue"
@@ -136,23 +134,22 @@ class RunWriter(StagedFolder):
 
     def _finish(self, more: dict[str, Any]) -> None:
         """Write the files of the whole run, and publish the folder."""
-        last, graph, _ = self._views[-1]
-        document = {"format": FORMAT, "version": 2, "views": len(self._views)} | self._about
+        count = len(self.steps)
+        document = {"format": FORMAT, "version": 2, "views": count} | self._about
         document["date"] = datetime.now(UTC).isoformat(timespec="seconds")
         document["versions"] = {"python": platform.python_version()} | {p: version(p) for p in PACKAGES}
-        document |= {name: last[name] for name in ("angle_travelled", "path_travelled")}
+        document |= {name: self.steps[-1][name] for name in ("angle_travelled", "path_travelled")}
         document["steps"] = self.steps
-        scores = [score for _, _, score in self._views if score is not None]
-        document |= ({"scores": scores} if scores else {}) | self.more | more
-        self.remove(_view_folder(len(self._views)))
-        for path, content in ({"graph.json": graph_text(graph).encode()} | self.files).items():
+        document |= ({"scores": self._scores} if self._scores else {}) | self.more | more
+        self.remove(_view_folder(count))
+        for path, content in ({"graph.json": graph_text(self._graph).encode()} | self.files).items():
             self.write(path, content)
         self.files = {}
         # A kill may leave files of the next view, to which nothing refers.
-        files, following = self.written, len(self._views)
+        files = self.written
         if "unfinished" in more:
             names = ("graph.json", "labels.png", "view.json", "step.npz")
-            files = files | {lift_file(following)} | {f"{_view_folder(following)}/{name}" for name in names}
+            files = files | {lift_file(count)} | {f"{_view_folder(count)}/{name}" for name in names}
         self.write("run.json", json_text(document | {"files": sorted(files)}).encode())
         self.publish()
 
