@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -55,7 +55,7 @@ class TwoObjects:
     second: Mask
     explanations: tuple[Explanation, Explanation]
     cost: float
-    by_colour: bool = False
+    by_colour: bool
 
 
 def split(
@@ -223,11 +223,10 @@ def _settled(
             seconds[k] = _connected(evidence.points, cost[1] < cost[0])
     settled: dict[int, TwoObjects] = {}
     for k, pair in explained_sides(first_look):
-        two = _two(evidence, seconds[k], pair, near, config)
         gain = _colours(evidence, seconds[k], config.explanation) if k < hinted else 0.0
-        by_colour = gain > price(None, config.explanation)
-        cost_of_parting = unity(evidence, seconds[k], config.explanation) - gain
-        settled[k] = replace(two, cost=two.cost + cost_of_parting, by_colour=by_colour)
+        total = pair[0].cost + pair[1].cost + _border(evidence, seconds[k], near, config)
+        total += unity(evidence, seconds[k], config.explanation) - gain
+        settled[k] = TwoObjects(seconds[k], pair, total, gain > price(None, config.explanation))
     return settled
 
 
@@ -364,25 +363,25 @@ def _gain(
     pair = [known[label] for label in labels]
     (first, alone), (second, other) = pair
     both = first.joined(second)
-    two = _two(both, np.arange(len(both)) >= len(first), (alone, other), _neighbours(both.points), config)
+    of_second, apart = np.arange(len(both)) >= len(first), alone.cost + other.cost
+    cost_of_two = apart + _border(both, of_second, _neighbours(both.points), config)
     one = best_explanation([e.shape for e in (alone, other) if e.shape is not None], both, costs)
     for first_look in (True, False):
         one = min(one, explain(both, costs, config.fit, rng, first_look=first_look), key=lambda e: e.cost)
-        if one.cost > two.cost + price(None, costs):
+        if one.cost > cost_of_two + price(None, costs):
             break
     colours = colour_evidence(first, second, costs)
-    gain = 0.0 if one.shape is None else two.cost - one.cost - colours
+    gain = 0.0 if one.shape is None else cost_of_two - one.cost - colours
     most = costs.irregular
     if not all(isinstance(e.shape, Shape) and explained(e, own, costs) for own, e in pair):
         # A compound has creases of its own: to it a border without one means nothing.
-        apart = alone.cost + other.cost - colours
-        compound = best_compound(both, config, apart - max(gain, 0.0))
+        compound = best_compound(both, config, apart - colours - max(gain, 0.0))
         if compound.shape is not None:
-            one, gain, most = compound, apart - compound.cost, costs.usual
+            one, gain, most = compound, apart - colours - compound.cost, costs.usual
     if gain <= 0.0:
         return 0.0
     cost = point_costs(one.shape, both, costs)
-    is_one = max(cost[two.second].mean(), cost[~two.second].mean()) <= most
+    is_one = max(cost[of_second].mean(), cost[~of_second].mean()) <= most
     return gain if is_one else 0.0
 
 
@@ -392,10 +391,8 @@ def _neighbours(points: Array) -> Groups:
     return np.asarray(cKDTree(points).query(points, k=count)[1]).reshape(len(points), count)
 
 
-def _two(
-    evidence: Evidence, second: Mask, pair: tuple[Explanation, Explanation], near: Groups, config: Config
-) -> TwoObjects:
-    """Two objects with these points; a border costs where the surface continues without a concave crease."""
+def _border(evidence: Evidence, second: Mask, near: Groups, config: Config) -> float:
+    """Cost [nats] of a border of two sides: where the surface continues without a concave crease."""
     row, col = np.repeat(np.arange(len(second)), near.shape[1]), near.ravel()
     across = second[row] != second[col]
     row, col = row[across], col[across]
@@ -403,5 +400,4 @@ def _two(
     turn = evidence.normals[col] - evidence.normals[row]
     bend = np.einsum("ij,ij->i", turn, between) / np.maximum(np.linalg.norm(between, axis=1), 1e-9)
     smooth = np.count_nonzero(bend > -np.sin(np.radians(config.segmentation.concavity)))
-    border = config.explanation.border * smooth * evidence.weight / near.shape[1]
-    return TwoObjects(second, pair, pair[0].cost + pair[1].cost + border)
+    return config.explanation.border * smooth * evidence.weight / near.shape[1]
