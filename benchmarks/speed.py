@@ -258,7 +258,7 @@ def _stages(recording: Recording, later: dict[str, list[Laps]], effort: Effort) 
     }
     for name in SEGMENTATIONS:
         for stage in [s for s in later[name][0] if s not in ("turn", "perceive")]:
-            what = f"{stage}, in the turn with {SEGMENTS[name]}"
+            what = f"{stage}, in a step with {SEGMENTS[name]}"
             took = [laps[stage] for laps in later[name]]
             rows.append(timed_row(f"stage.{name}.{stage}", what, took, limit=limits.get(stage)))
     return rows

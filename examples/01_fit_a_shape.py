@@ -38,7 +38,7 @@ def main() -> None:
     assert abs(fit.shape.height - can.height) < 0.003
     tilt = np.degrees(np.arccos(abs(fit.shape.T_world_object[2, 2])))
     assert tilt < 2.0
-    print(f"the truth: radius {1000 * can.radius:.0f} mm, height {1000 * can.height:.0f} mm, upright")
+    print(f"ground truth: radius {1000 * can.radius:.0f} mm, height {1000 * can.height:.0f} mm, upright")
 
 
 if __name__ == "__main__":

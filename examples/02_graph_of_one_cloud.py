@@ -39,12 +39,12 @@ def main() -> None:
 
     print(f"{len(cloud)} points, {len(graph.objects) - 1} objects on the table (o0)")
     for support in graph.supports:
-        print(f"  {support.supporter} holds {support.supported}: {support.why}")
+        print(f"  {support.supporter} supports {support.supported}: {support.why}")
     assert {support.pair for support in graph.supports} == truth
 
     # The same as a networkx graph: what falls if the first pillar is removed?
     assert sorted(scene.supports.successors("o1")) == ["o3"]
-    print("taking o1 away would disturb", ", ".join(sorted(scene.supports.successors("o1"))))
+    print("removing o1 would disturb", ", ".join(sorted(scene.supports.successors("o1"))))
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ def main() -> None:
     for support in step.graph.supports:
         seen = f"in {support.occurrences} of {support.opportunities} views"
         likely = f"probability {support.belief:.2f}"
-        print(f"{support.supporter} holds {support.supported} ({support.kind}, {seen}, {likely})")
+        print(f"{support.supporter} supports {support.supported} ({support.kind}, {seen}, {likely})")
 
     assert f1[-1] > f1[0], "looking around must pay"
     assert f1[-1] > 0.9

@@ -36,7 +36,7 @@ def main() -> None:
                 graph = drive(RobotClient(json.loads(printed + "}")["address"]), stage)
             finally:
                 service.terminate()
-    print(*(f"{s['supporter']} holds {s['supported']} ({s['kind']})" for s in graph["supports"]), sep="\n")
+    print(*(f"{s['supporter']} supports {s['supported']} ({s['kind']})" for s in graph["supports"]), sep="\n")
     assert len(graph["supports"]) >= 3
     assert service.returncode == 0
 

@@ -182,7 +182,7 @@ def test_the_robots_own_arm_is_no_object(with_arm, tmp_path, capsys):
     for source, mask, said in (
         (with_arm / "arm", "small.png", "ignored is 240×54, depth is 240×180"),
         (with_arm / "arm", "none.png", "the file is missing"),
-        ("tower", "mask.png", "simulated images do not show"),
+        ("tower", "mask.png", "--ignore is for recordings"),
     ):
         given = ("--ignore", with_arm / mask, "--out", tmp_path / "none")
         assert run_command("explore", source, *given) == 1

@@ -371,7 +371,7 @@ class TestEveryPlanner:
             plan(name, [CUBE], offered=replace(none, rejected={}))
         empty = plan(name, [])
         if name in ("support", *VOLUMETRIC):
-            assert empty.why.endswith("the cheapest new view")
+            assert empty.why.endswith("this one is the cheapest")
             assert degrees_between(HOME, OPEN.directions[empty.index]) > 5.0
         recorded = RecordingRobot(SPHERE.poses(np.stack([HOME, direction(0.0, 0.5), direction(1.5, 0.5)])))
         offered = recorded.candidates(SPHERE)

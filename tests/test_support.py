@@ -405,7 +405,7 @@ class TestInfer:
         assert explain(infer(objects, PAPER), "o2", "o1", PAPER).startswith(
             "o2 does not support o1: it is not"
         )
-        with pytest.raises(InputError, match="no such object"):
+        with pytest.raises(InputError, match="not an object of the graph"):
             explain(graph, "o1", "o9", CONFIG)
         with pytest.raises(InputError, match="itself"):
             explain(graph, "o1", "o1", CONFIG)
@@ -527,7 +527,7 @@ class TestRemoval:
 
     def test_unknown_objects_and_the_table_are_refused(self):
         graph = infer(tower(), CONFIG)
-        with pytest.raises(InputError, match="no such object"):
+        with pytest.raises(InputError, match="not an object of the graph"):
             predict_removal(graph, "o9", CONFIG)
         with pytest.raises(InputError, match="support surface"):
             predict_removal(graph, "o0", CONFIG)

@@ -8,12 +8,11 @@ from pathlib import Path
 HEADING = """Examples
 ========
 
-Programs of under sixty lines, each run when this page was built; what it printed stands below it. Each proves
-what it says against a truth it knows, and the tests run them all. The client is only shown: by itself it has
-nobody to ask.
+Short programs. Each runs when this page is built; its output follows it. Each checks its result against the
+ground truth. The client is only shown, because it needs a running service.
 """
 RUN = re.compile(r"/\d\d_")
-"""Which of the programs are run: those with a number. The client has nobody to ask by itself."""
+"""Which of the programs are run: those with a number. The client needs a running service."""
 
 
 def copy_examples(examples: Path, destination: Path) -> None:

@@ -415,7 +415,7 @@ class Scene(Pictured):
             over = observation.surface.over(observation.cloud.points_world, low, high, 0.0)
             if over.sum() * self.config.cloud.voxel**2 >= self.config.segmentation.min_area:
                 remedy = "no mask covers them" if masks else "move closer, or give a larger image or masks"
-                log.warning("%s: no object in %d points above the table; %s", name, over.sum(), remedy)
+                log.warning("%s: %d points above the table belong to no object; %s", name, over.sum(), remedy)
 
     def _registered(self, observation: Observation, named: bool) -> tuple[Observation, set[int]]:
         """Register the view to the earlier ones, and correct their poses too.

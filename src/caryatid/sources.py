@@ -86,7 +86,7 @@ def open_source(
 
     Raises:
         InputError: The source is unknown, broken, or lacks required labels; or the robot is unknown, a
-            robot is given for a recording, or an ignore mask for a simulation.
+            robot is given for a recording, or an ignore mask or `level` for a simulation.
         PlanningError: The robot cannot reach a view of the table.
     """
     if is_cloud(source):
@@ -98,8 +98,9 @@ def open_source(
         recording = open_recording(source, config, segmentation, masks, ignore, level)
         poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
         return Source(recording.path.name, RecordingCamera(recording), RecordingRobot(poses), None)
-    if ignore is not None:
-        raise InputError(source, "simulated images do not show the robot", "omit --ignore")
+    for option, given in (("--ignore", ignore is not None), ("--level", level)):
+        if given:
+            raise InputError(source, f"is a simulation, and {option} is for recordings", f"omit {option}")
     return simulate(source, noise=noise, robot=robot, seed=seed, config=config)
 
 

@@ -122,7 +122,7 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True)
 class Modelling(Settings):
-    """Settings that turn views into a scene model."""
+    """Settings of the method."""
 
     preset: Annotated[Preset, one_of(Preset)] = "default"
     """Settings to start from: caryatid's defaults, or those of the paper."""
@@ -131,7 +131,8 @@ class Modelling(Settings):
     masks: Annotated[
         str | None, tyro.conf.arg(metavar="{scene,per-view,onnx:FILE,FOLDER}"), default_of("fusion.masks")
     ] = None
-    """What mask numbers identify: objects (scene) or segments of a view (per-view). Or a model or folder."""
+    """What mask numbers identify: objects (scene) or segments of a view (per-view).
+    Or where masks come from: a model or a folder."""
     seed: Annotated[int, whole_number(0)] = 0
     """Random seed; the same seed gives the same graph, byte for byte."""
 
@@ -199,7 +200,7 @@ class LookingCommand(ComputingCommand):
     ] = None
     """Use the given masks or labels, or segment automatically."""
     ignore: Annotated[Path | None, shown("MASK.png")] = None
-    """Pixels to ignore, such as the robot's arm: a grey PNG, 0 = keep; or a folder of NAME.png by view."""
+    """Pixels to ignore, such as the robot's arm: a grey PNG, 0 = keep; or a folder, one NAME.png per view."""
 
     def mask_source(self, config: Config) -> MaskSource | None:
         """The source of masks, or None.

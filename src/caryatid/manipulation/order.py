@@ -209,7 +209,7 @@ def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
     try:
         edges = nx.find_cycle(blocked, trial.object_id)
     except nx.NetworkXNoCycle:
-        harm = ", ".join(trial.harmed) or "nothing, but rehearsal.draws are too few for the risk"
+        harm = ", ".join(trial.harmed) or "nothing, but rehearsal.draws is too small to show this risk"
         return f"no safe order: lifting {trial.object_id} disturbs {harm}"
     cycle = ", ".join(f"lifting {a} disturbs {b}" for a, b in edges)
     return f"no safe order: {cycle}"
@@ -242,7 +242,7 @@ class _Rehearsal:
             raise InputError("graph", "has no support surface", "give a graph with a table")
         self.ids = tuple(o.id for o in graph.objects if o.role == "object")
         if not self.ids:
-            raise InputError("graph", "has no objects", "give a graph with objects to remove")
+            raise InputError("graph", "has no objects to remove", "give a graph with objects")
         self._groups = _groups([graph[i].shape for i in self.ids], 2.0 * config.lift.moved)
         largest = int(np.bincount(self._groups).max())
         if largest > config.rehearsal.max_objects:

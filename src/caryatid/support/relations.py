@@ -79,7 +79,7 @@ def infer(
         InputError: Two objects have the same id.
     """
     if len({o.id for o in objects}) < len(objects):
-        raise InputError("objects", "two of them have the same id", "give every object an id of its own")
+        raise InputError("objects", "two of them have the same id", "give each object a unique id")
     ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
     if config.stability == "area":
         return _by_area(ordered, config)
@@ -162,7 +162,7 @@ def _index(graph: SupportGraph, object_id: str) -> int:
     """The place of the object of that id; an InputError if there is none."""
     ids = [o.id for o in graph.objects]
     if object_id not in ids:
-        raise InputError(object_id, "no such object in the graph", f"there are {', '.join(ids)}")
+        raise InputError(object_id, "is not an object of the graph", f"known objects: {', '.join(ids)}")
     return ids.index(object_id)
 
 

@@ -113,7 +113,7 @@ def order_table(order: Order) -> Table:
         )
         for number, step in enumerate(order.steps, 1)
     )
-    return Table.of("Steps", ("", "remove", "hold", "P(no other moves)", "reason"), rows)
+    return Table.of("Steps", ("", "remove", "hold", "P(nothing else moves)", "reason"), rows)
 
 
 def size_of(shape: Shape) -> str:

@@ -126,7 +126,7 @@ def _why(samples: Samples, gain: Array) -> str:
     """One sentence: which objects a view shows more of."""
     total = float(gain.sum())
     if total <= 0.0:
-        return "no view is expected to show anything hidden; the cheapest new view"
+        return "no view is expected to show anything hidden; this one is the cheapest"
     worth: dict[str, float] = {}
     shares = np.bincount(samples.subjects, weights=gain, minlength=len(samples.names))
     for name, share in zip(samples.names, shares, strict=True):

@@ -82,7 +82,7 @@ class VolumetricPlanner:
     def _why(self, gain: Array, best: int) -> str:
         """One sentence: how the chosen view's information compares with the others'."""
         if gain.max() <= 0.0:
-            return f"no view is expected to add {self._formulation} information; the cheapest new view"
+            return f"no view is expected to add {self._formulation} information; this one is the cheapest"
         ratio, share = gain[best] / gain.mean(), gain[best] / gain.max()
         mean = f"{ratio:.1f} times the mean {self._formulation} information of all views"
         return f"{mean}, {share:.0%} of the maximum"
