@@ -86,7 +86,7 @@ class Evaluate(options.Command):
 
     run: options.RunPath
     """Run folder."""
-    truth: Annotated[str | None, tyro.conf.Positional, options.shown("GT", "the run's source")] = None
+    truth: Annotated[str | None, tyro.conf.Positional, options.shown("[GT]", "the run's source")] = None
     """Scene (built-in name, scene.xml or its folder), or a recording with masks and gt.json."""
 
     def __call__(self) -> None:
