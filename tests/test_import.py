@@ -30,11 +30,12 @@ from hypothesis import strategies as st
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
-from caryatid.config import RecordingConfig
+from caryatid.config import Config, RecordingConfig
 from caryatid.geometry import transforms
 from caryatid.io import read_recording
 from caryatid.io.images import png
 from caryatid.io.importing import choose_views
+from caryatid.sources import open_recording
 
 TOPICS = ("--depth", DEPTH, "--info", INFO)
 ALL = (*TOPICS, "--rgb", RGB, "--tf", WORLD)
@@ -318,13 +319,17 @@ def test_a_folder_of_the_benchmark_becomes_the_views_it_holds(tmp_path, views):
 
 
 @pytest.mark.parametrize(("number", "fx"), [(1, 517.3), (2, 520.9), (3, 535.4)])
-def test_the_name_of_the_folder_says_which_camera(tmp_path, views, capsys, number, fx):
+def test_the_name_of_the_folder_says_which_camera(tmp_path, views, capsys, caplog, number, fx):
     view = views[0]
     depth, rgb = np.kron(view.depth, np.ones((4, 4))), np.kron(view.rgb, np.ones((4, 4, 1), np.uint8))
     large = replace(view, depth=depth, rgb=rgb, labels=None)
-    (read,) = imported(tmp_path, tum_folder(tmp_path, [large], f"rgbd_dataset_freiburg{number}_xyz"))
+    folder, note = tum_folder(tmp_path, [large], f"rgbd_dataset_freiburg{number}_xyz"), "published camera"
+    (read,) = imported(tmp_path, folder)
     assert read.K[0, 0] == fx
-    assert f"published camera of freiburg{number}: fx {fx:g}" in capsys.readouterr().err
+    assert f"{note} of freiburg{number}: fx {fx:g}" in capsys.readouterr().err
+    with caplog.at_level("INFO"):
+        open_recording(str(folder), Config(), None)
+    assert note in caplog.text
 
 
 def spoil(name, text):

@@ -163,8 +163,8 @@ def open_recording(
         recording = replace(recording, frames=frames)
     if level:
         recording = levelled(recording, config)
-        for note in recording.notes:
-            log.info(note)
+    for note in recording.notes:
+        log.info(note)
     if segmentation == "labels" and masks is None and not recording.has_labels:
         raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
     points: Counter[int] = Counter()
