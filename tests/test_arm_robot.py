@@ -6,10 +6,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from arms import LIMITS, assert_gaze, base_at, gantry, sideways_only, within_arms_length
-from synthetic import SENSOR
+from synthetic import FEW_VIEWS, SENSOR, look_from
 from test_docs import ROOT, blocks
 
-from caryatid.config import ActiveVisionConfig, ArmConfig, Config, RobotConfig
+from caryatid.config import ActiveVisionConfig, ArmConfig, RobotConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import explore
 from caryatid.geometry import transforms
@@ -20,7 +20,6 @@ from caryatid.robots.reachability import sample_reachability
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation import load_scene
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.simulation.setup import make_simulation
 
 PAGE = ROOT / "docs/robot.md"
 
@@ -35,8 +34,8 @@ def arm(reachable=within_arms_length, T_world_base=BASE, config=CONFIG, **given)
     return ArmRobot(reachable, T_world_base, config, **given)
 
 
-def never(T_base_camera):
-    return np.zeros(len(T_base_camera), dtype=bool)
+def offered(robot):
+    return robot.candidates(robot.view_sphere(PROPOSED))
 
 
 def roll_of(T_world_camera):
@@ -55,8 +54,7 @@ class TestViewSphere:
 
     def test_the_largest_with_nearly_as_many_views_is_taken(self):
         def count(radius: float) -> int:
-            robot = arm(config=replace(CONFIG, radius=(radius, radius)))
-            return len(robot.candidates(robot.view_sphere(PROPOSED)))
+            return len(offered(arm(config=replace(CONFIG, radius=(radius, radius)))))
 
         chosen = arm().view_sphere(PROPOSED).radius
         most = max(count(float(r)) for r in np.linspace(*CONFIG.radius, 13))
@@ -115,13 +113,15 @@ class TestCandidates:
         np.testing.assert_array_equal(robot.T_world_camera, found.T_world_camera[7])
 
     def test_waypoints_hold_the_joints_that_confirm_gives(self):
-        robot = arm(confirm=lambda T: T[:3, 3])
-        views = robot.candidates(robot.view_sphere(PROPOSED)).T_world_camera
+        base = base_at(-0.5, 0.1, 0.75, 30.0)
+        robot = arm(T_world_base=base, confirm=lambda T: T[:3, 3])
+        views = offered(robot).T_world_camera
         assert robot.waypoints(views[0])[0].joints is None
         robot.move_to(views[0])
         assert robot.confirm(views[9]) is None
         for posture, T in zip(robot.waypoints(views[9]), views[[0, 9]], strict=True):
-            np.testing.assert_array_equal(posture.joints, (transforms.invert(BASE) @ T)[:3, 3])
+            np.testing.assert_array_equal(posture.joints, (transforms.invert(base) @ T)[:3, 3])
+            np.testing.assert_allclose(posture.platform_world, [-0.5, 0.1, np.deg2rad(30.0)])
             assert_gaze(posture, T)
         assert [p.joints for p in (arm(T_world_camera=views[0])).waypoints(views[9])] == [None, None]
         assert arm(confirm=lambda T: None).confirm(views[0]) is not None
@@ -134,7 +134,7 @@ class TestCandidates:
         reach = sample_reachability(gantry, LIMITS, 20_000, rng, CONFIG)
         for reachable in (within_arms_length, sideways_only, reach):
             robot, moved = arm(reachable), arm(reachable, T @ BASE)
-            here = robot.candidates(robot.view_sphere(PROPOSED))
+            here = offered(robot)
             elsewhere = moved.candidates(moved.view_sphere(there))
             assert moved.view_sphere(there).radius == robot.view_sphere(PROPOSED).radius
             assert elsewhere.rejected == here.rejected
@@ -143,14 +143,6 @@ class TestCandidates:
 
 
 class TestSolve:
-    def test_every_candidate_has_a_posture(self):
-        robot = arm(T_world_base=base_at(-0.5, 0.1, 0.75, 30.0))
-        found = robot.candidates(robot.view_sphere(PROPOSED))
-        for T in found.T_world_camera[::20]:
-            posture = robot.solve(T)
-            np.testing.assert_allclose(posture.platform_world, [-0.5, 0.1, np.deg2rad(30.0)])
-            assert_gaze(posture, T)
-
     @pytest.mark.parametrize(
         ("reachable", "eye", "distance"),
         [(within_arms_length, (2.0, 0.0, 1.5), 2.61), (sideways_only, (-0.3, 0.0, 1.2), 0.49)],
@@ -173,34 +165,31 @@ class TestSolve:
             robot.view_sphere(PROPOSED)
 
 
+SETTINGS = replace(FEW_VIEWS, arm=CONFIG)
+
+
+def first_step(reachable, confirm=None):
+    """The first, and only, step of an exploration with an arm that goes nowhere."""
+    camera = SimulatedCamera(load_scene("tower"), sensor=SENSOR)
+    robot = arm(reachable, confirm=confirm, T_world_camera=look_from(180.0))
+    (step,) = explore(camera, robot, config=SETTINGS)
+    return step
+
+
 @pytest.mark.slow
-class TestExploring:
-    SETTINGS = Config(
-        sensor=SENSOR,
-        arm=CONFIG,
-        active=ActiveVisionConfig(sphere_points=2000, look_directions=200, max_views=3),
-    )
+def test_where_nothing_is_in_reach_it_stops_with_reasons_and_counts():
+    step = first_step(lambda T_base_camera: np.zeros(len(T_base_camera), dtype=bool))
+    low, out = (step.candidates.rejected[reason] for reason in (REASONS[0], REASONS[2]))
+    assert low + out == CONFIG.sphere_points
+    assert step.stop == f"no candidate views left: {REASONS[0]} ({low}), {REASONS[2]} ({out})"
 
-    @pytest.fixture
-    def stage(self):
-        def make(around):
-            return ArmRobot(within_arms_length, around.T_world_base, around.config.arm)
 
-        return make_simulation(load_scene("tower"), self.SETTINGS, noise="none", seed=0, robot=make)
-
-    def test_where_nothing_is_in_reach_it_stops_with_reasons_and_counts(self, stage):
-        stage.robot._reachable = never
-        step = next(explore(stage.camera, stage.robot, config=self.SETTINGS))
-        low, out = (step.candidates.rejected[reason] for reason in (REASONS[0], REASONS[2]))
-        assert low + out == CONFIG.sphere_points
-        assert step.stop == f"no candidate views left: {REASONS[0]} ({low}), {REASONS[2]} ({out})"
-
-    def test_an_arm_that_confirms_nothing_stops(self, stage):
-        asked = []
-        stage.robot._confirm = lambda T: asked.append(T)
-        (step,) = explore(stage.camera, stage.robot, config=self.SETTINGS)
-        assert step.stop == f"the robot refused 20 views in a row: {UNCONFIRMED}"
-        assert len(asked) == 20
+@pytest.mark.slow
+def test_an_arm_that_confirms_nothing_stops():
+    asked = []
+    step = first_step(within_arms_length, asked.append)
+    assert step.stop == f"the robot refused 20 views in a row: {UNCONFIRMED}"
+    assert len(asked) == 20
 
 
 class Rig:
@@ -237,12 +226,11 @@ def test_the_hardware_of_the_page_on_robots_goes_around_the_table():
     page = {}
     exec(code, page)
     assert len(code.splitlines()) < 40
-    settings = TestExploring.SETTINGS
     T_hand_camera = base_at(0.02, -0.06, 0.03, 90.0)
     rig = Rig(SimulatedCamera(load_scene("tower"), sensor=SENSOR), T_hand_camera)
     robot = page["RealArm"](rig, within_arms_length, BASE, T_hand_camera)
     camera = page["HandCamera"](rig, rig, BASE, T_hand_camera)
-    steps = list(explore(camera, robot, config=settings, early_stop=False))
+    steps = list(explore(camera, robot, config=SETTINGS, early_stop=False))
     assert (len(steps), rig.gone) == (3, 2)
     assert steps[-1].path_travelled > 0.3
     assert steps[0].candidates.rejected[UNCONFIRMED] == 1
