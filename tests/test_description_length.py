@@ -18,7 +18,6 @@ from caryatid.objects.description_length import (
     best_compound,
     best_explanation,
     explain,
-    point_costs,
     price,
 )
 from caryatid.objects.model_selection import best_merge, split
@@ -55,14 +54,6 @@ def pair_of(clouds, changed=None, apart=None, voxels=None, config=CONFIG):
     return best_merge(known, everything, {} if apart is None else apart, config=config, seed=0)
 
 
-def test_a_point_costs_by_its_distance_over_the_noise_and_by_its_turn():
-    ball = sphere((0.0, 0.0, 0.0), 0.05)
-    points = np.array([[0.05, 0.0, 0.0], [0.053, 0.0, 0.0], [0.05, 0.0, 0.0], [0.2, 0.0, 0.0]])
-    normals = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, np.sqrt(0.75), 0.0], [1.0, 0.0, 0.0]])
-    cost = point_costs(ball, Evidence(points, normals, 1.0, 0.003, None), COSTS)
-    np.testing.assert_allclose(cost, (0.0, 0.5, 0.5 * COSTS.normal_weight, COSTS.outlier), atol=1e-9)
-
-
 def test_points_of_no_shape_are_left_without_one():
     rng = np.random.default_rng(0)
     crumpled = Evidence(
@@ -94,19 +85,19 @@ def test_points_that_determine_nothing_have_a_finite_cost(spread, count):
 
 STACKED = (box((0.0, 0.0, 0.05), (0.16, 0.12, 0.1)), box((0.03, 0.0, 0.15), (0.06, 0.06, 0.1)))
 SIDE_BY_SIDE = (box((0.0, -0.06, 0.05), (0.1, 0.12, 0.1)), box((0.0, 0.04, 0.1), (0.1, 0.08, 0.2)))
+BRIDGE = (
+    *(box((0.0, y, 0.05), (0.06, 0.06, 0.1)) for y in (-0.09, 0.09)),
+    box((0.0, 0.0, 0.115), (0.06, 0.26, 0.03)),
+)
 CAN_ON_BOX = (box((0.0, 0.0, 0.04), (0.14, 0.14, 0.08)), cylinder((0.0, 0.0, 0.14), 0.03, 0.12))
 
 
 def points_of(shapes, sigma=0.001, seed=0):
     rng = np.random.default_rng(seed)
-    parts = [surface_points(s, rng, eye=(-1.2, -0.6, 1.0), spacing=0.006, sigma=sigma) for s in shapes]
+    parts = [surface_points(s, rng, eye=EYE, spacing=0.006, sigma=sigma) for s in shapes]
     points = np.concatenate([p for p, _ in parts])
     normals = np.concatenate([n for _, n in parts])
     return points, normals, np.repeat(np.arange(len(parts)), [len(p) for p, _ in parts])
-
-
-PILLARS = [box((0.0, y, 0.05), (0.06, 0.06, 0.1)) for y in (-0.09, 0.09)]
-BRIDGE = (*PILLARS, box((0.0, 0.0, 0.115), (0.06, 0.26, 0.03)))
 
 
 @pytest.mark.parametrize(
@@ -157,8 +148,8 @@ def test_a_view_that_is_off_leaves_a_layer_and_no_second_object():
     assert apart[0.007] <= 1
 
 
-def cloud_of(shape, eye=EYE, seed=0):
-    points, normals = surface_points(shape, np.random.default_rng(seed), eye=eye, spacing=0.006, sigma=0.001)
+def cloud_of(shape, seed=0):
+    points, normals, _ = points_of([shape], seed=seed)
     return Cloud(points, normals)
 
 
