@@ -31,12 +31,6 @@ def names_of(*parts, known=KNOWN, shapes=SHAPES, config=CONFIG, **options):
     return {part: n[0] if len(n) == 1 else n for part, n in enumerate(names, start=1)}
 
 
-def test_a_part_is_the_object_in_whose_points_it_lies():
-    crate = seen(CRATE, seed=1)
-    left = crate[:, 1] < 0.0
-    assert names_of(seen(BALL, seed=1), crate[left], crate[~left]) == {1: 7, 2: 3, 3: 3}
-
-
 def test_a_part_of_a_side_never_seen_is_the_object_in_whose_shape_it_lies():
     front = KNOWN[3][KNOWN[3][:, 0] < -0.045]
     behind = seen(CRATE)

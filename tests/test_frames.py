@@ -95,10 +95,3 @@ def test_numbers_that_are_no_rotation_make_no_pose(q):
     assert not is_pose((0.0, 0.0, 0.0, *q))
     assert not is_pose((np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
     assert not is_pose((0.0, 0.0, 0.0, 1.0))
-
-
-def test_a_quaternion_need_not_have_length_one():
-    tree = TransformTree(1.0)
-    tree.add("map", "eye", NOW, (1.0, 1.0, 1.0, 0.0, 0.0, 2.0, 2.0))
-    turn = transforms.rotation_from_vector((0.0, 0.0, np.pi / 2))
-    assert np.allclose(tree.between("map", "eye", NOW), transforms.rigid(turn, np.ones(3)))
