@@ -14,7 +14,7 @@ from synthetic import random_motion
 from caryatid.config import ActiveVisionConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
-from caryatid.geometry.points import last_in_voxels, most_central, quantile, select, solve_positive
+from caryatid.geometry.points import last_in_voxels, quantile, select, solve_positive
 from caryatid.geometry.polygons import area, cap, hull, intersection, signed_distance
 from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import (
@@ -351,20 +351,8 @@ def test_rays_out_of_the_far_corner_stay_within_the_grid():
         assert met.max(initial=0) < np.prod(GRID)
 
 
-EDGES = np.array([0.0, 0.02, 0.05])
-
-
-@pytest.fixture
-def points():
-    rng = np.random.default_rng(0)
-    return rng.uniform(-0.15, 0.15, size=(4000, 3)) * (1.0, 1.0, 0.2)
-
-
-def test_points_are_thinned_by_voxels(points):
-    twice = np.repeat([[0.005, 0.005, 0.005], [0.013, 0.005, 0.005]], [2, 2], axis=0)
-    assert most_central(twice, np.ones(4, dtype=np.int32), EDGES).tolist() == [0]
-    for nothing in (np.zeros((0, 3)), np.zeros((5, 3))):
-        assert len(most_central(nothing, np.zeros(len(nothing), dtype=np.int32), EDGES)) == 0
+def test_the_last_points_of_each_voxel_are_kept():
+    points = np.random.default_rng(0).uniform(-0.15, 0.15, size=(4000, 3)) * (1.0, 1.0, 0.2)
     assert len(last_in_voxels(np.zeros((0, 3)), 0.02, 3)) == 0
     voxel = np.floor(points / 0.03).astype(int)
     later = [(voxel[i:] == voxel[i]).all(axis=1).sum() for i in range(len(points))]
