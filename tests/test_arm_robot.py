@@ -79,13 +79,11 @@ class TestCandidates:
 
     def test_every_view_is_a_candidate_or_counted_with_its_reason(self):
         wall = Box(transforms.rigid(np.eye(3), (0.0, 0.4, 1.0)), np.array([1.2, 0.04, 2.0]))
-        robot = arm(furniture=FloorGrid.from_boxes([wall], RobotConfig()))
-        sphere = robot.view_sphere(PROPOSED)
-        found = robot.candidates(sphere)
+        found = offered(arm(furniture=FloorGrid.from_boxes([wall], RobotConfig())))
         assert set(found.rejected) == set(REASONS)
-        assert len(found) + sum(found.rejected.values()) == len(sphere.directions)
+        assert len(found) + sum(found.rejected.values()) == CONFIG.sphere_points
         assert found.T_world_camera[:, 1, 3].max() < 0.4
-        free = arm().candidates(sphere)
+        free = offered(arm())
         assert free.T_world_camera[:, 1, 3].max() > 0.4
         assert free.rejected.keys() == {REASONS[0], REASONS[2]}
 
