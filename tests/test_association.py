@@ -9,7 +9,6 @@ from synthetic import box, sphere, surface_points
 from caryatid.config import SegmentationConfig
 from caryatid.objects.models import associate
 
-CONFIG = SegmentationConfig()
 CRATE, BALL = box((0.0, 0.0, 0.8), (0.1, 0.12, 0.1)), sphere((0.3, 0.0, 0.79), 0.04)
 
 
@@ -21,11 +20,11 @@ KNOWN = {3: seen(CRATE, eye=(-1.0, 0.0, 1.5)), 7: seen(BALL, eye=(-1.0, 0.0, 1.5
 SHAPES = {3: CRATE, 7: BALL}
 
 
-def names_of(*parts, known=KNOWN, shapes=SHAPES, config=CONFIG, **options):
+def names_of(*parts, known=KNOWN, shapes=SHAPES, **options):
     """Labels that parts numbered 1, 2, … get; beside them are points of no part."""
     points = np.concatenate([*parts, np.zeros((5, 3))])
     labels = np.concatenate([np.full(len(p), k) for k, p in enumerate(parts, start=1)] + [np.zeros(5)])
-    found = associate(points, labels.astype(np.int32), known, shapes, config, **options)
+    found = associate(points, labels.astype(np.int32), known, shapes, SegmentationConfig(), **options)
     assert (found[labels == 0] == 0).all()
     names = [sorted({int(k) for k in found[labels == part]}) for part in range(1, len(parts) + 1)]
     return {part: n[0] if len(n) == 1 else n for part, n in enumerate(names, start=1)}
