@@ -15,6 +15,7 @@ from caryatid.io import read_recording, write_recording
 from caryatid.sensing.views import View
 
 K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
+MASK = "mask_visib/000001_000001.png"
 
 
 def make_views():
@@ -91,7 +92,7 @@ def test_views_are_read_one_by_one_and_not_kept(folder):
         recording[0]
 
 
-@pytest.mark.parametrize("name", ["depth/000001.png", "rgb/000001.png", "mask_visib/000001_000001.png"])
+@pytest.mark.parametrize("name", ["depth/000001.png", "rgb/000001.png", MASK])
 def test_an_image_that_is_missing_or_truncated_is_refused(folder, name):
     path = folder / name
     content = path.read_bytes()
@@ -105,12 +106,8 @@ def test_an_image_that_is_missing_or_truncated_is_refused(folder, name):
 @pytest.mark.parametrize(
     ("name", "image", "said"),
     [
-        (
-            "mask_visib/000001_000001.png",
-            Image.new("L", (63, 48)),
-            "63×48 pixels, but the depth image has 64",
-        ),
-        ("mask_visib/000001_000001.png", Image.new("L", (64, 48), 255), "overlaps the mask of obj_id 7 in"),
+        (MASK, Image.new("L", (63, 48)), "63×48 pixels, but the depth image has 64"),
+        (MASK, Image.new("L", (64, 48), 255), "overlaps the mask of obj_id 7 in"),
         ("depth/000002.png", Image.new("L", (64, 48), 1), "mode L, not a 16-bit grey PNG"),
         ("depth/000002.png", Image.new("I;16", (64, 48)), "the frame is empty"),
     ],
