@@ -76,19 +76,6 @@ def test_how_much_must_overlap_is_a_setting(share, name):
     assert names_of(mixed, config=replace(CONFIG, overlap=0.9)) == {1: 8}
 
 
-def test_a_part_across_two_objects_is_divided_between_them():
-    beside = box((0.0, 0.11, 0.8), (0.1, 0.1, 0.1))
-    known, shapes = KNOWN | {5: seen(beside)}, SHAPES | {5: beside}
-    both = [seen(CRATE, seed=2), seen(beside, seed=2)]
-    assert names_of(np.concatenate(both), known=known, shapes=shapes) == {1: [3, 5]}
-    labels = np.ones(sum(map(len, both)), dtype=np.int32)
-    found = associate(np.concatenate(both), labels, known, shapes, CONFIG)
-    at_crate, at_other = np.split(found, [len(both[0])])
-    # Where the two touch, points are as near to the one as to the other.
-    assert (at_crate == 3).mean() > 0.8
-    assert (at_other == 5).mean() > 0.8
-
-
 def test_a_few_points_beside_its_neighbour_do_not_divide_a_part():
     beside = box((0.0, 0.09, 0.8), (0.1, 0.06, 0.1))
     known = KNOWN | {5: seen(beside)}

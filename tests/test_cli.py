@@ -86,15 +86,6 @@ def test_a_recording_is_explored_where_it_was_recorded(tmp_path, recording):
     assert run.record["steps"][-1]["stop"].startswith("no candidate views left")
 
 
-def test_all_views_of_a_recording_are_extracted(tmp_path, recording):
-    assert run_command("extract", recording, "--out", tmp_path / "run") == 0
-    run = read_run(tmp_path / "run")
-    assert [v.name for v in run.views] == [f"recording/{k:06d}" for k in range(3)]
-    assert {s.pair for s in run.graph.supports} == {("o0", "o1"), ("o1", "o2")}
-    assert run.record["steps"][2]["angle_travelled"] > run.record["steps"][1]["angle_travelled"] > 0.0
-    assert (tmp_path / "run/report.html").is_file()
-
-
 @pytest.mark.parametrize("segmentation", ["labels", "auto"])
 def test_views_before_the_first_that_shows_the_table_are_kept_for_it(tmp_path, capsys, segmentation):
     views, graphs = simulated_views("tower")[1:3], []
@@ -191,9 +182,18 @@ def test_without_a_command_it_shows_how_to_start(capsys):
     assert "caryatid demo" in capsys.readouterr().out
 
 
-def test_a_run_is_scored_against_its_scene(kept_run, scene_file, capsys):
-    assert run_command("evaluate", kept_run, scene_file.parent, "--json") == 0
-    views = json.loads(capsys.readouterr().out)["views"]
+def test_a_run_is_scored_against_the_ground_truth_of_its_source_or_of_a_place(
+    tmp_path, kept_run, scene_file, capsys
+):
+    def scored(*arguments):
+        capsys.readouterr()
+        assert run_command("evaluate", *arguments, "--json") == 0
+        return capsys.readouterr().out
+
+    assert scored(kept_run) == scored(kept_run, scene_file.parent) == scored(kept_run, scene_file)
+    assert run_command("extract", "sample-recording", "--out", tmp_path / "run", "--no-report") == 0
+    assert scored(tmp_path / "run") == scored(tmp_path / "run", "sample-recording")
+    views = json.loads(scored(kept_run))["views"]
     assert [v["view"] for v in views] == [0, 1]
     keys = {"view", "precision", "recall", "f1", "edge_precision", "edge_recall", "mean_iou", "brier"}
     assert all(v.keys() >= keys for v in views)

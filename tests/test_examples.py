@@ -1,4 +1,4 @@
-"""Examples and notebooks run; examples say something and are short, notebooks are stored as they show."""
+"""Examples and notebooks run; examples say something and prove it, notebooks are stored as they show."""
 
 from __future__ import annotations
 
@@ -37,14 +37,8 @@ def test_an_example_runs_and_says_what_it_found(path, monkeypatch, capsys, tmp_p
     run_example(path, monkeypatch)
     assert len(capsys.readouterr().out.splitlines()) >= 5
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_is_short_typed_and_proves_what_it_says(path):
-    text = path.read_text()
-    assert len(text.splitlines()) < 60
-    assert "-> None:" in text
-    assert "assert " in text
+    assert "assert " in path.read_text()
+    assert len(path.read_text().splitlines()) < 60
 
 
 @pytest.mark.skipif(not MOSD.is_dir(), reason="the recorded frames of ../shared are not here")

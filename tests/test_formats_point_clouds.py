@@ -111,14 +111,6 @@ def test_missing_readings_are_dropped_and_labels_spread_back(tmp_path_factory, m
     assert not back[gone].any()
 
 
-def test_label_divisor_joins_parts_to_objects(tmp_path):
-    data = plane()
-    data["label"] = 20 + np.arange(60) % 3
-    data["label"][:5] = 3
-    stored = read_stored_cloud(write(tmp_path / "a.pcd", data), label_divisor=10)
-    assert (stored.labels == np.where(np.arange(60) < 5, 0, 2)).all()
-
-
 @pytest.mark.parametrize(("value", "kind"), [(-1, "<i4"), (0.5, "<f4"), (np.nan, "<f4"), (65535, "<u4")])
 def test_labels_that_are_no_object_numbers_are_refused(tmp_path, value, kind):
     data = np.zeros(6, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("label", kind)])

@@ -76,13 +76,6 @@ def test_a_run_is_read_back_and_laid_out_as_documented(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["deep"]
 
 
-def test_clouds_have_one_label_a_point(tmp_path):
-    write_run(tmp_path / "RUN", labels=np.array([0, 3, 65535], np.int32))
-    labels = read_run(tmp_path / "RUN").views[0].load_labels()
-    assert labels.tolist() == [0, 3, 65535]
-    assert labels.dtype == np.load(tmp_path / "RUN/views/00/labels.npy").dtype == np.int32
-
-
 def test_the_same_run_gives_the_same_bytes(tmp_path):
     """All but the date."""
     for name in ("a", "b"):

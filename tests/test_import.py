@@ -219,17 +219,6 @@ def test_dark_blurred_and_equal_frames_are_counted(tmp_path, views, capsys):
     assert [view["frame"] for view in document["views"]] == [0, 4]
 
 
-def test_a_broken_image_is_left_out(tmp_path, views, capsys):
-    data = compressed_depth(views[0].depth, "16UC1")
-
-    def depth(bag, time):
-        broken = time == START + SECOND
-        return bag.compressed(time, data[:500] if broken else data, "16UC1; compressedDepth png")
-
-    document = summary(tmp_path, capsys, plain_bag(tmp_path, views, depth), *TOPICS, "--tf", WORLD)
-    assert document["skipped"] == {"broken": 1}
-
-
 # Bags that will not do
 
 
