@@ -141,3 +141,9 @@ def test_only_objects_can_be_taken_and_only_what_is_rigid_moves(scene):
     with pytest.raises(InputError, match="add a view first"):
         Scene().added(box((0.0, 0.0, 0.8), (0.1, 0.1, 0.1)))
     assert scene.changes == ()
+
+
+def test_copies_change_by_themselves(scene):
+    other = scene.copy()
+    scene.removed("o4")
+    assert (len(other.graph.objects), other.changes) == (6, ())
