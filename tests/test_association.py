@@ -1,9 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-import pytest
 from synthetic import box, sphere, surface_points
 
 from caryatid.config import SegmentationConfig
@@ -63,17 +60,6 @@ def test_a_few_points_of_another_colour_go_to_the_neighbour_that_has_it():
     other_colour[len(crate) : len(part), 0] = True
     other_colour[: len(crate), 1] = True
     assert names_of(part, other_colour=other_colour) == {1: [3, 7]}
-
-
-@pytest.mark.parametrize(("share", "name"), [(0.2, 8), (0.5, 3)])
-def test_how_much_must_overlap_is_a_setting(share, name):
-    rng = np.random.default_rng(0)
-    at_object = rng.permutation(seen(CRATE, seed=1))[: int(400 * share)]
-    elsewhere = seen(box((0.0, 0.4, 0.8), (0.1, 0.1, 0.1)))[: int(400 * (1.0 - share))]
-    mixed = np.concatenate([at_object, elsewhere])
-    assert names_of(mixed) == {1: name}
-    assert names_of(mixed, config=replace(CONFIG, overlap=0.1)) == {1: 3}
-    assert names_of(mixed, config=replace(CONFIG, overlap=0.9)) == {1: 8}
 
 
 def test_a_few_points_beside_its_neighbour_do_not_divide_a_part():

@@ -8,7 +8,7 @@ from raycast import K, from_the_side, table_scene
 
 from caryatid.config import CloudConfig
 from caryatid.geometry import transforms
-from caryatid.sensing.clouds import estimate_normals, local_planes, oriented_points, thin
+from caryatid.sensing.clouds import estimate_normals, oriented_points, thin
 from caryatid.sensing.views import View
 
 CONFIG = CloudConfig()
@@ -64,25 +64,6 @@ def test_points_lie_on_the_pixels_rays_and_turn_with_the_camera():
     moved, turned, _ = oriented_points(view, CONFIG)
     np.testing.assert_allclose(moved, transforms.transform(view.pose, points), atol=1e-12)
     np.testing.assert_allclose(turned, transforms.rotate(view.pose, normals), atol=1e-12)
-
-
-def roof(sigma):
-    """Inverse depth of two planes that meet in a ridge down the middle column, each with its normal."""
-    column = np.arange(80.0) - 40.0
-    true = np.broadcast_to(1.0 - 0.004 * np.abs(column), (60, 80))
-    noise = np.random.default_rng(4).normal(0.0, sigma, true.shape)
-    return true, (true + noise).astype(np.float32)
-
-
-def test_smoothing_takes_noise_off_and_leaves_a_ridge_sharp():
-    sigma = 0.002
-    true, noisy = roof(sigma)
-    inner = (slice(6, -6), slice(6, -6))
-    error = np.abs(local_planes(noisy, 3, 0.02, 0.004)[2] - true)[inner]
-    assert np.sqrt(np.mean(error**2)) < sigma / 3.0
-    ridge = error[:, 33:36].mean()
-    unguarded = np.abs(true - np.mean([np.roll(true, k, axis=1) for k in range(-3, 4)], axis=0))[6:-6, 39:42]
-    assert ridge < 0.8 * unguarded.mean()
 
 
 def test_readings_left_out_are_no_points_and_bear_on_none():
