@@ -76,10 +76,10 @@ def random_motion(rng: np.random.Generator, reach: float = 1.0) -> Array:
     return transforms.rigid(transforms.random_rotation(rng), rng.uniform(-reach, reach, 3))
 
 
-def motion_about_vertical(rng: np.random.Generator, reach: float = 1.0) -> Array:
-    """A rotation about the vertical, and a translation of up to `reach` [m] along each axis."""
+def motion_about_vertical(rng: np.random.Generator) -> Array:
+    """A rotation about the vertical, and a translation of up to 1 m along each axis."""
     R = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
-    return transforms.rigid(R, rng.uniform(-reach, reach, 3))
+    return transforms.rigid(R, rng.uniform(-1.0, 1.0, 3))
 
 
 def surface_points(
@@ -157,9 +157,9 @@ def simulated_cloud(name: str) -> Cloud:
     )
 
 
-def model_of(sources, config: Config | None = None, *, seed: int = 0, segmentation="labels") -> Scene:
+def model_of(sources, config: Config | None = None, *, segmentation="labels") -> Scene:
     """The scene model of some views or clouds."""
-    scene = Scene(config, segmentation=segmentation, seed=seed)
+    scene = Scene(config, segmentation=segmentation)
     for source in sources:
         scene.update(source)
     return scene

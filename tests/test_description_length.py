@@ -30,9 +30,9 @@ EYE = (-1.2, -0.6, 1.0)
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def gather(cloud, voxels=None, costs=COSTS):
-    kept = cloud.select(thin(cloud.points_world, costs.spacing))
-    weight = costs.spacing**2 / costs.reading
+def gather(cloud, voxels=None):
+    kept = cloud.select(thin(cloud.points_world, COSTS.spacing))
+    weight = COSTS.spacing**2 / COSTS.reading
     return Evidence(kept.points_world, kept.normals_world, weight, 0.003, voxels, kept.rgb)
 
 
@@ -41,10 +41,15 @@ def alone_in(evidence):
     return explain(evidence, COSTS, FIT, np.random.default_rng(0))
 
 
-def divided(points, normals):
+def groups_of(evidence):
     """Group of each point, or None where they are one object."""
+    return split(evidence, alone_in(evidence), up=UP, config=CONFIG, rng=np.random.default_rng(0))
+
+
+def divided(points, normals):
+    """Group of each point, before they are thinned."""
     evidence = gather(Cloud(points, normals))
-    groups = split(evidence, alone_in(evidence), config=CONFIG, rng=np.random.default_rng(0))
+    groups = groups_of(evidence)
     return None if groups is None else groups[cKDTree(evidence.points).query(points)[1]]
 
 
@@ -56,13 +61,8 @@ def pair_of(clouds, changed=None, apart=None, voxels=None, config=CONFIG):
 
 def test_points_of_no_shape_are_left_without_one():
     rng = np.random.default_rng(0)
-    crumpled = Evidence(
-        rng.uniform(-0.1, 0.1, (400, 3)),
-        transforms.unit(rng.normal(size=(400, 3))),
-        1.0,
-        0.003,
-        None,
-    )
+    points, normals = rng.uniform(-0.1, 0.1, (400, 3)), transforms.unit(rng.normal(size=(400, 3)))
+    crumpled = Evidence(points, normals, 1.0, 0.003, None)
     few = crumpled.select(np.arange(FIT.min_points - 1))
     for evidence in (crumpled, few):
         best = explain(evidence, COSTS, FIT, rng)
@@ -189,9 +189,9 @@ def test_what_something_in_front_cut_in_two_is_one_and_looked_at_again_when_it_h
     assert pair_of({1: left, 2: right}, apart={(1, 2): 10}) is not None
 
 
-def bowl(azimuths, seed=0):
+def bowl(azimuths):
     """Outside of a lobed bowl that widens upwards, of the directions [rad] given: none of the shapes."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     azimuth, height = rng.uniform(*azimuths, 2500), rng.uniform(0.0, 0.06, 2500)
     opening, turning = 1.0 + 0.5 * np.sin(4.0 * azimuth), 2.0 * height * np.cos(4.0 * azimuth)
     radius = 0.03 + height * opening
@@ -222,9 +222,7 @@ def test_flush_boxes_are_two_where_a_view_showed_each_in_a_colour_of_its_own(lef
     whole = gather(Cloud(points, normals, rgb=rgb))
     shown = 1 + (whole.points[None, :, 1] < 0.0).astype(np.int32)
     for segments, divided in ((shown, not merged), (None, False)):
-        whole = replace(whole, segments=segments)
-        groups = split(whole, alone_in(whole), config=CONFIG, rng=rng)
-        assert (groups is not None) == divided
+        assert (groups_of(replace(whole, segments=segments)) is not None) == divided
 
 
 def test_a_row_of_flush_boxes_is_divided_where_a_view_showed_each_in_a_colour_of_its_own():
@@ -234,8 +232,7 @@ def test_a_row_of_flush_boxes_is_divided_where_a_view_showed_each_in_a_colour_of
     rgb = np.clip(colours[place] + rng.normal(0.0, 3.0, (len(points), 3)), 0, 255).astype(np.uint8)
     whole = gather(Cloud(points, normals, rgb=rgb))
     place = np.clip(np.floor(whole.points[:, 1] / 0.06).astype(int) + 2, 0, 3)
-    whole = replace(whole, segments=(place[None] + 1).astype(np.int32))
-    groups = split(whole, alone_in(whole), config=CONFIG, rng=rng)
+    groups = groups_of(replace(whole, segments=(place[None] + 1).astype(np.int32)))
     sides = [place == k for k in range(4)]
     assert [np.mean(groups == np.bincount(groups[own]).argmax()) for own in sides] == pytest.approx(
         [own.mean() for own in sides], abs=0.02
@@ -252,8 +249,7 @@ def test_boxes_side_by_side_are_one_object_where_most_views_show_one(views, part
     evidence = gather(Cloud(points, normals))
     left, count = evidence.points[:, 0] < 0.03, len(evidence)
     segments = np.array([np.where(left, *labels) for labels in views], dtype=np.int32).reshape(-1, count)
-    evidence = replace(evidence, segments=segments)
-    groups = split(evidence, alone_in(evidence), config=CONFIG, rng=np.random.default_rng(0))
+    groups = groups_of(replace(evidence, segments=segments))
     assert (1 if groups is None else len(np.unique(groups))) == parts
 
 
@@ -281,10 +277,10 @@ def test_irregular_neighbours_stay_two_also_where_the_surface_goes_on():
     assert pair_of({1: standing, 2: paper}) is None
 
 
-def visible(shape, spacing=0.005, eye=(0.9, 0.3, 0.9)):
-    """Noisy points of a shape that the eye sees past the shape itself, with normals."""
-    points, normals = shape.surface(spacing)
-    way = np.asarray(eye) - points
+def visible(shape):
+    """Noisy points of a shape that an eye sees past the shape itself, with normals."""
+    points, normals = shape.surface(0.005)
+    way = (0.9, 0.3, 0.9) - points
     seen = np.einsum("ni,ni->n", way, normals) > 0.0
     for far in np.linspace(0.006, 0.3, 40):
         seen &= shape.signed_distance(points + far * transforms.unit(way)) > -1e-4

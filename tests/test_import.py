@@ -50,9 +50,9 @@ def bag_of(tmp_path, views, kind=KINDS[0], **options):
     return tmp_path / name
 
 
-def imported(tmp_path, source, *options, name="out"):
-    assert run_command("import", source, *options, "--out", tmp_path / name) == 0
-    return read_recording(tmp_path / name)
+def imported(tmp_path, source, *options):
+    assert run_command("import", source, *options, "--out", tmp_path / "out") == 0
+    return read_recording(tmp_path / "out")
 
 
 @pytest.fixture
@@ -322,23 +322,22 @@ def test_the_name_of_the_folder_says_which_camera(tmp_path, views, capsys, caplo
 
 
 def spoil(name, text):
-    return lambda folder: (folder / name).write_text(text)
+    return lambda folder: (folder / name).write_bytes(text)
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (spoil("depth.txt", ""), "has no depth images"),
-        (spoil("depth.txt", "noon depth/x.png\n"), "a row does not start with a time in seconds"),
-        (spoil("depth.txt", "1.0\n"), "'1.0' has 1 columns, not 2"),
-        (spoil("depth.txt", "nan depth/x.png\n"), "a row does not start with a time in seconds"),
-        (spoil("groundtruth.txt", "1.0 0 0 0\n"), "has 4 columns, not 8"),
-        (spoil("groundtruth.txt", "1.0 0 0 0 0 0 0 0\n"), "is not a pose"),
-        (spoil("groundtruth.txt", "1.0 0 0 0 0 0 0 one\n"), "is not a pose"),
-        (spoil("groundtruth.txt", "# none\n"), "none of its 3 depth images is usable: 3 no pose"),
-        (spoil("rgb.txt", "# none\n"), "3 no colour image at that time"),
+        (spoil("depth.txt", b""), "has no depth images"),
+        (spoil("depth.txt", b"noon depth/x.png\n"), "a row does not start with a time in seconds"),
+        (spoil("depth.txt", b"1.0\n"), "'1.0' has 1 columns, not 2"),
+        (spoil("depth.txt", b"nan depth/x.png\n"), "a row does not start with a time in seconds"),
+        (spoil("depth.txt", b"\xff\xfe"), "depth.txt: cannot be read"),
+        (spoil("groundtruth.txt", b"1.0 0 0 0 0 0 0 0\n"), "is not a pose"),
+        (spoil("groundtruth.txt", b"1.0 0 0 0 0 0 0 one\n"), "is not a pose"),
+        (spoil("groundtruth.txt", b"# none\n"), "none of its 3 depth images is usable: 3 no pose"),
+        (spoil("rgb.txt", b"# none\n"), "3 no colour image at that time"),
         (lambda folder: shutil.rmtree(folder / "depth"), "3 broken"),
-        (lambda folder: (folder / "depth.txt").write_bytes(b"\xff\xfe"), "depth.txt: cannot be read"),
     ],
 )
 def test_a_folder_that_is_broken(tmp_path, views, unfit, change, said):
