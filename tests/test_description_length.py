@@ -43,7 +43,7 @@ def alone_in(evidence):
 
 def groups_of(evidence):
     """Group of each point, or None where they are one object."""
-    return split(evidence, alone_in(evidence), up=UP, config=CONFIG, rng=np.random.default_rng(0))
+    return split(evidence, alone_in(evidence), config=CONFIG, rng=np.random.default_rng(0))
 
 
 def divided(points, normals):
