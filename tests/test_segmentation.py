@@ -13,8 +13,6 @@ from caryatid.config import CloudConfig, Config, FitConfig, SegmentationConfig, 
 from caryatid.errors import PerceptionError
 from caryatid.geometry import transforms
 from caryatid.scene import Scene
-from caryatid.segmentation.affinities import OFFSETS, affinities
-from caryatid.segmentation.lccp import convex_parts
 from caryatid.segmentation.observation import observe
 from caryatid.segmentation.seams import GAP, cut_at_seams, find_seams
 from caryatid.segmentation.segments import cut_by_colour, segment, segment_cloud
@@ -151,49 +149,6 @@ def test_the_area_of_a_segment_does_not_depend_on_the_spacing_of_points(spacing)
     assert set(labels[len(points[0]) :]) == {0}
 
 
-def bent_sheet(angle: float):
-    """Two square sheets that meet along x = 0 under an angle [deg]; positive = a valley seen from above."""
-    side = np.arange(0.0, 0.1, 0.005)
-    s, y = (g.ravel() for g in np.meshgrid(side, side, indexing="ij"))
-    rise = np.radians(angle / 2.0)
-    right = np.stack([s * np.cos(rise), y, s * np.sin(rise)], axis=-1)
-    right = right + np.array([0.0025, 0.0, 0.0])
-    points = np.concatenate([right, right * (-1, 1, 1)])
-    normal = np.array([-np.sin(rise), 0.0, np.cos(rise)])
-    normals = np.repeat([normal, normal * (-1, 1, 1)], len(right), axis=0)
-    distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    edges = np.argwhere(np.triu(distance <= 0.0075, k=1))
-    return points, normals, edges
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("angle", "parts"), [(-90.0, 1), (-20.0, 1), (0.0, 1), (40.0, 2), (90.0, 2)])
-def test_sheets_part_where_they_are_concave(angle, parts):
-    points, normals, edges = bent_sheet(angle)
-    config = SegmentationConfig()
-    labels = convex_parts(points, normals, edges, config)
-    assert len(np.unique(labels)) == parts
-    assert labels.min() == 1
-    assert len(np.unique(labels[: len(labels) // 2])) == 1
-    T = transforms.rigid(transforms.random_rotation(np.random.default_rng(1)), (0.2, 0.1, 0.4))
-    moved = convex_parts(transforms.transform(T, points), transforms.rotate(T, normals), edges, config)
-    assert len(np.unique(moved)) == parts
-
-
-def test_depth_steps_along_a_border_outweigh_a_short_bridge():
-    points, normals, edges = bent_sheet(0.0)
-    side = points[:, 0] > 0.0
-    across = side[edges[:, 0]] != side[edges[:, 1]]
-    bridge = np.flatnonzero(across)[:6]
-    bridged = np.concatenate([edges[~across], edges[bridge]])
-    steps = edges[np.setdiff1d(np.flatnonzero(across), bridge)]
-    config = SegmentationConfig()
-    assert len(np.unique(convex_parts(points, normals, bridged, config))) == 1
-    parts = convex_parts(points, normals, bridged, config, steps)
-    assert len(np.unique(parts[side])) == len(np.unique(parts[~side])) == 1
-    assert parts[side][0] != parts[~side][0]
-
-
 def bowl(T_world_camera, radius=0.09, rim=0.07):
     """A bowl, thin as a shell, upside up on the table: part of a sphere below its rim."""
     view = table_scene(T_world_camera)
@@ -237,24 +192,6 @@ SCENES = {
     "boxes of other heights behind a post": (FRONT, [POST, HALF, solid(0.1, 0.08, 0.06, 0.13, 0.16)]),
     "boxes of other depths behind a post": (FRONT, [POST, HALF, solid(0.1, 0.05, 0.16, 0.13, 0.1, x=0.05)]),
 }
-
-
-def test_the_network_tells_two_boxes_apart_and_each_from_the_table():
-    view = table_scene(FRONT, [HALF, solid(0.1, 0.05, 0.06, 0.13, 0.1)], sigma=0.001)
-    grid, K_grid = np.s_[::2, ::2], K / np.array([[2.0], [2.0], [1.0]])
-    odds = affinities(view.depth[grid], None, K_grid, UP @ FRONT[:3, :3], FRONT[2, 3] - TABLE)
-    labels = view.labels[grid]
-    for right, expected in ((12, True), (32, False)):  # within a box, and across the 7 cm between them
-        first, other, same = (
-            labels[:, :-right],
-            labels[:, right:],
-            odds[OFFSETS.index((0, right))][:, :-right],
-        )
-        both = (first > 0) & (other > 0) & ((first == other) == expected)
-        assert both.sum() > 100
-        assert ((same[both] > 0.0) == expected).mean() > 0.9
-    assert (odds[-1] > 0.0)[labels > 0].mean() > 0.95
-    assert (odds[-1] > 0.0)[labels == 0].mean() < 0.02
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.0015])
@@ -354,13 +291,6 @@ def test_a_seam_is_dark_straight_and_as_long_as_its_border_and_divides_one_face(
         rgb = np.repeat(image[..., None], 3, axis=2).astype(np.uint8)
         seam = find_seams(rgb, (slice(0, 80, 2), slice(0, 120, 2)))
         assert cut_at_seams(part, facing, seam, GAP // 2, 40).max() == number
-
-
-def test_what_is_over_the_table_goes_by_height_and_outline():
-    surface = surface_of(table_scene(from_the_side()))
-    points = np.array([[0, 0, 0.8], [0, 0, 0.751], [0, 0, 0.5], [0, 0, 1.6], [0.6, 0, 0.8], [0.32, 0, 0.8]])
-    kept = surface.over(points, 0.008, 0.6, 0.05)
-    assert kept.tolist() == [True, False, False, False, False, True]
 
 
 def open_box(width=0.2, height=0.1, wall=0.01):
