@@ -118,24 +118,8 @@ def test_merging_commutes_with_any_motion_and_any_order():
         assert hausdorff(merged_sightings(there).shape, merged.shape.moved(T)) < 1e-12
 
 
-@pytest.mark.parametrize("degrees", [0.0, 7.0, 40.0])
-def test_the_angle_between_boxes_is_the_least_their_symmetry_allows(degrees):
-    reference = box((0.0, 0.0, 0.0), (0.1, 0.2, 0.3))
-    for quarter in range(4):
-        turned = box((0.0, 0.0, 0.0), (0.1, 0.2, 0.3), turn_deg=degrees + 90.0 * quarter)
-        turn, angle = axes_rotation(turned, reference)
-        assert np.degrees(angle) == pytest.approx(degrees, abs=1e-5)
-        aligned = turned.T_world_object[:3, :3] @ turn
-        assert np.degrees(transforms.angle_between(aligned.T, np.eye(3))).max() <= degrees + 1e-5
-
-
 def test_a_cylinder_has_an_axis_and_no_ends_to_tell_apart():
     upright = cylinder((0.0, 0.0, 0.0), 0.03, 0.1)
-    over = upright.moved(
-        transforms.rigid(transforms.rotation_from_vector((np.pi - 0.2, 0.0, 0.0)), np.zeros(3))
-    )
-    turn, angle = axes_rotation(over, upright)
-    assert angle == pytest.approx(0.2)
-    assert (over.T_world_object[:3, :3] @ turn)[2, 2] > 0.9
-    spun = upright.moved(transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, 1.0)), np.zeros(3)))
-    assert axes_rotation(spun, upright)[1] == pytest.approx(0.0)
+    for turn, expected in (((np.pi - 0.2, 0.0, 0.0), 0.2), ((0.0, 0.0, 1.0), 0.0)):
+        turned = upright.moved(transforms.rigid(transforms.rotation_from_vector(turn), np.zeros(3)))
+        assert axes_rotation(turned, upright)[1] == pytest.approx(expected)
