@@ -9,7 +9,7 @@ from synthetic import TABLE_TOP, motion_about_vertical, simulated_cloud, simulat
 from caryatid.config import Config
 from caryatid.errors import InputError, PerceptionError
 from caryatid.geometry import transforms
-from caryatid.segmentation.observation import label_image, level_transform, observe
+from caryatid.segmentation.observation import level_transform, observe
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
 CONFIG = Config()
@@ -36,15 +36,6 @@ def test_given_labels_stay_and_the_table_gets_its_own():
     floor = observation.cloud.points_world[:, 2] < 0.1
     assert floor.sum() > 100
     assert (observation.labels[floor] == 0).all()
-
-
-def test_what_is_shown_is_each_label_once():
-    observation = observation_of(VIEW, "labels")
-    assert observation.shown == np.unique(observation.labels).tolist()
-    renamed = observation.relabelled({observation.shown[1]: 99})
-    assert 99 in renamed.shown
-    assert observation.shown[1] not in renamed.shown
-    assert observation.with_labels(np.full_like(observation.labels, 7)).shown == [7]
 
 
 def test_what_is_below_the_known_table_is_not_looked_at():
@@ -108,15 +99,6 @@ def test_nothing_is_an_error_that_names_it(pose):
             level_transform(cloud, CONFIG, rng)
 
 
-def test_a_view_of_a_wall_has_no_support_surface():
-    wall = View(
-        np.full((120, 160), 1.0), np.array([[131.0, 0, 79.5], [0, 131.0, 59.5], [0, 0, 1]]), name="wall"
-    )
-    level = transforms.look_at((0.0, 0.0, 1.0), (1.0, 0.0, 1.0))
-    with pytest.raises(PerceptionError, match="wall: no support surface"):
-        observation_of(wall.with_pose(level))
-
-
 @pytest.mark.parametrize("rise", [1.0, -2.0])
 def test_a_view_in_which_the_table_is_not_seen_keeps_the_one_known(rise):
     known = observation_of(VIEW).surface
@@ -143,32 +125,11 @@ def test_new_names_replace_old_ones_all_at_once():
     assert not (observation.labels == 9).any()
 
 
-def test_a_moved_observation_is_moved_in_all_its_parts():
-    observation = observation_of(VIEW)
-    T = motion_about_vertical(np.random.default_rng(0))
-    there = observation.moved(T)
-    np.testing.assert_allclose(
-        there.cloud.points_world, transforms.transform(T, observation.cloud.points_world), atol=1e-12
-    )
-    np.testing.assert_allclose(there.view.pose, T @ observation.view.pose)
-    np.testing.assert_allclose(
-        there.surface.height(there.cloud.points_world),
-        observation.surface.height(observation.cloud.points_world),
-        atol=1e-12,
-    )
-    np.testing.assert_array_equal(there.labels, observation.labels)
-
-
-def test_the_label_image_holds_each_label_at_its_pixel():
-    observation = observation_of(VIEW, "labels")
-    image = label_image(observation, VIEW)
-    assert image.shape == VIEW.depth.shape
-    np.testing.assert_array_equal(image.ravel()[observation.pixels], observation.labels)
-    rest = np.ones(image.size, dtype=bool)
-    rest[observation.pixels] = False
-    assert (image.ravel()[rest] == 0).all()
-    cloud = simulated_cloud("tower")
-    assert label_image(observation_of(cloud), cloud).shape == (len(cloud),)
+def test_the_table_moves_with_an_observation():
+    here = observation_of(VIEW)
+    there = here.moved(motion_about_vertical(np.random.default_rng(0)))
+    heights = (o.surface.height(o.cloud.points_world) for o in (here, there))
+    np.testing.assert_allclose(*heights, atol=1e-12)
 
 
 def test_a_cloud_in_its_sensors_frame_is_levelled():
