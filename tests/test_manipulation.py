@@ -296,15 +296,6 @@ class TestDismantling:
         assert (bottom.film[:, 2, 2] > ASIDE / 2.0).all()
         np.testing.assert_array_equal(bottom.film[-1, :, 2] > ASIDE / 2.0, [True, False, True, False])
 
-    def test_what_leans_on_two_things_falls_when_one_is_taken(self):
-        shapes = (
-            box((0.0, 0.0, TOP + 0.06), (0.06, 0.2, 0.12)),
-            box((0.1, 0.0, TOP + 0.06), (0.06, 0.2, 0.12)),
-            sphere((0.05, 0.0, TOP + 0.14), 0.035),
-        )
-        (taken,) = dismantle(in_physics(*shapes), [take("o1")])
-        assert taken.disturbed == ("object2",)
-
     def test_the_scene_stays_as_it_is_and_can_be_shown_otherwise(self, scene):
         before = poses_of(scene)
         (taken,) = dismantle(scene, [take("o3")])
@@ -362,14 +353,6 @@ class TestCommands:
         assert [i for i in lifts if i] == ["o2", "o1"]
         assert [o.role for o in run.graph.objects] == ["support_surface"]
 
-    def test_to_reach_one_object_only_what_is_in_the_way_goes(self, scene_file, tmp_path, capsys):
-        for goal, taken in (("o2", ["o2"]), ("o1", ["o2", "o1"])):
-            command = ["clear", scene_file, "--goal", goal, "--json", "--out", tmp_path / goal, "--no-report"]
-            assert run_command(*command, *SMALL, *QUICK) == 0
-            document = json.loads(capsys.readouterr().out)
-            assert (document["success"], document["stop"]) == (True, f"{goal} is removed")
-            assert [step["object"] for step in document["steps"]] == taken
-
     def test_it_looks_at_the_goal_before_it_takes_what_is_in_the_way(self):
         table = simulate("bridge")
         explorer = Explorer(table.camera, table.robot, config=CONFIG)
@@ -394,7 +377,7 @@ class TestCommands:
             document = json.loads(capsys.readouterr().out)
             assert [step["object"] for step in document["steps"]] == taken
             assert all(0.0 <= step["grasp"]["seen_free"] < 0.95 for step in document["steps"])
-            assert ("was not seen empty" in document["stop"]) == (not taken)
+            assert ("was not seen empty" if not taken else "o1 is removed") in document["stop"]
 
     def test_it_keeps_looking_while_no_lift_is_safe(self, scene_file, tmp_path, capsys):
         command = ["clear", scene_file, "--views", 6, "--set=active.effort=1", "--json", "--no-report"]

@@ -156,17 +156,6 @@ def test_the_middle_of_a_table_that_is_turned_is_in_its_upper_face(size, turn, m
     np.testing.assert_allclose(table_centre(scene), middle, atol=1e-9)
 
 
-@NEEDS_SHARED
-def test_scanned_objects():
-    scene = load_scene(SHARED / "ycb00_4")
-    shapes = true_shapes(scene)
-    assert {shape.kind for shape in shapes.values()} == {"solid"}
-    low, high = bounds(scene, 4)
-    np.testing.assert_allclose(high - low, 0.063, atol=0.005)
-    centre = (low + high)[None] / 2.0
-    assert shapes[4].signed_distance(centre) < 0.0 < shapes[1].signed_distance(centre)
-
-
 # Built-in and generated scenes
 
 
