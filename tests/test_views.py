@@ -37,18 +37,6 @@ def test_points_project_back_to_their_pixels_at_their_depth():
     np.testing.assert_allclose(points[..., 2], DEPTH, atol=1e-7)
 
 
-def test_a_view_from_another_pose_is_the_same_view():
-    view = View(DEPTH, K, np.eye(4), labels=np.ones((4, 5), dtype=np.int32), name="first")
-    T = transforms.rigid(transforms.random_rotation(np.random.default_rng(0)), (1.0, 2.0, 3.0))
-    there = view.with_pose(T)
-    np.testing.assert_array_equal(there.pose, T)
-    np.testing.assert_array_equal(view.pose, np.eye(4))
-    np.testing.assert_array_equal(there.points_camera, view.points_camera)
-    np.testing.assert_array_equal(there.labels, view.labels)
-    with pytest.raises(InputError, match="first: T_world_camera"):
-        view.with_pose(2.0 * np.eye(4))
-
-
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
