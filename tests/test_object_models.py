@@ -170,25 +170,6 @@ def test_views_add_up_and_dividing_and_merging_keep_every_point():
     assert len(points.everything()) == 30
 
 
-def test_a_move_moves_the_points_of_its_views_only():
-    points = two_views()
-    add(points, cloud(3, 9, 7.0), 2)
-    before = {k: points.of(k) for k in (1, 3, 9)}
-    copied = points.copy()
-    T = transforms.rigid(transforms.random_rotation(np.random.default_rng(0)), (1.0, 2.0, 3.0))
-    assert points.move({1: T}) == {1, 3, SUPPORT_LABEL}
-    assert points.move({}) == set()
-    for label, count in ((1, 4), (3, 6)):
-        old, new = before[label], points.of(label)
-        np.testing.assert_array_equal(new.points_world[:count], old.points_world[:count])
-        np.testing.assert_allclose(
-            new.points_world[count:], transforms.transform(T, old.points_world[count:])
-        )
-        np.testing.assert_allclose(new.normals_world[count:], transforms.rotate(T, old.normals_world[count:]))
-        np.testing.assert_array_equal(copied.of(label).points_world, old.points_world)
-    np.testing.assert_array_equal(points.of(9).points_world, before[9].points_world)
-
-
 def test_many_views_leave_no_more_than_the_newest_points_of_a_place():
     points = ObjectPoints()
     for view in range(9):

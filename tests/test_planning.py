@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import SMALL
-from scipy.spatial import Delaunay
 
 from caryatid.config import ActiveVisionConfig, RobotConfig, SupportConfig, VoxelConfig
 from caryatid.errors import InputError, PlanningError
@@ -28,10 +27,8 @@ from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.expected_visibility import (
     SPACE,
-    SPACE_WEIGHT,
     relation_samples,
     space_above,
-    space_samples,
     surface_samples,
     visibility,
 )
@@ -225,43 +222,10 @@ class TestCandidates:
 
 
 class TestExpectedVisibility:
-    GRAPH = SupportGraph((TABLE, CUBE))
-    OCCLUDERS = known(TABLE, CUBE).occluders()
-    SAMPLES = surface_samples(GRAPH, OCCLUDERS)
-
-    def test_surfaces_in_contact_are_not_asked_for(self):
-        samples = self.SAMPLES
-        assert 250 < len(samples.points_world) < 500
-        assert np.abs(CUBE.shape.signed_distance(samples.points_world)).max() < 1e-9
-        assert samples.normals_world[:, 2].min() > -0.5, "the face on the table"
-        assert samples.weights.sum() == pytest.approx(5.0 / 6.0, abs=0.01)
-        flat = box(2, (0.0, 0.3, 0.76), (0.3, 0.2, 0.02))
-        both = surface_samples(SupportGraph((TABLE, CUBE, flat)), known(TABLE, CUBE, flat).occluders())
-        for subject, open_ in ((0, 5.0 / 6.0), (1, (0.06 + 0.02) / (0.12 + 0.02))):
-            assert both.weights[both.subjects == subject].sum() == pytest.approx(open_ / 2.0, abs=0.05)
-        assert len(surface_samples(SupportGraph((TABLE,)), known(TABLE).occluders()).weights) == 0
-
-    def test_a_surface_is_seen_from_before_and_less_from_aside_and_not_from_behind(self):
-        samples, occluders = self.SAMPLES, self.OCCLUDERS
-        seen = visibility(samples, SPHERE.poses(HOME[None]), occluders, CONFIG)[:, 0]
-        assert seen[samples.normals_world[:, 0] < -0.9].min() == 1.0
-        assert seen[samples.normals_world[:, 0] > 0.9].max() == 0.0
-        low = visibility(samples, SPHERE.poses(direction(np.pi, np.deg2rad(10.0))[None]), occluders, CONFIG)[
-            :, 0
-        ]
-        top = samples.normals_world[:, 2] > 0.9
-        rays = SPHERE.poses(direction(np.pi, np.deg2rad(10.0))[None])[0, :3, 3] - samples.points_world[top]
-        cosine = rays[:, 2] / np.linalg.norm(rays, axis=1)
-        np.testing.assert_allclose(low[top][low[top] > 0.0], (cosine / 0.5)[low[top] > 0.0])
-        assert (low[top] > 0.0).mean() > 0.5
-        away = SPHERE.poses(HOME[None])
-        away[0, :3, :3] = away[0, :3, :3] @ transforms.rotation_from_vector((0.0, np.deg2rad(45.0), 0.0))
-        assert visibility(samples, away, occluders, CONFIG).max() == 0.0, "outside the image"
-
     def test_walls_hide_but_where_occlusion_is_ignored(self):
         wall = box(2, (0.0, 0.10, 0.95), (0.5, 0.02, 0.4))
         occluders = known(TABLE, CUBE, wall).occluders()
-        samples = surface_samples(self.GRAPH, occluders)
+        samples = surface_samples(SupportGraph((TABLE, CUBE)), occluders)
         beyond = SPHERE.poses(direction(np.pi / 2.0, np.deg2rad(35.0))[None])
         seen, through = (
             visibility(samples, beyond, occluders, replace(CONFIG, occlusion=how))[:, 0]
@@ -281,41 +245,6 @@ class TestExpectedVisibility:
         wide = box(0, (0.0, 0.0, 0.73), (7.0, 0.5, 0.04))
         low, high = space_above(SupportGraph((wide, CUBE)), known(TABLE))
         assert (low[0], high[0]) == (known(TABLE).origin_world[0], known(TABLE).end_world[0])
-
-    def test_space_on_the_table_counts_while_it_has_not_been_seen(self):
-        """Compared with a lattice walked point by point, over a table and objects turned aside."""
-        table = box(0, (0.02, 0.0, 0.73), (0.5, 0.9, 0.04), yaw=30.0)
-        objects = [box(1, (0.1, 0.15, 0.8), (0.1, 0.06, 0.1), 40.0), box(2, (-0.1, 0.0, 0.85), (0.06,) * 3)]
-        objects.append(box(3, (0.1, -0.15, 0.79), (0.08, 0.08, 0.08)))
-        graph = SupportGraph((table, *objects))
-        occluders = half_known(seen_in_a_corner, table, *objects).occluders([o.shape for o in objects])
-        samples = space_samples(graph, occluders)
-        low, high = space_above(graph, occluders.voxels)
-        heap = Delaunay(np.concatenate([o.shape.outline()[:, :2] for o in objects]))
-        wanted, total, total_in_heap = {}, 0.0, 0.0
-        for point in np.stack(
-            np.meshgrid(*(np.arange(*ends, 0.04) for ends in zip(low, high, strict=True))), -1
-        ).reshape(-1, 3):
-            aside = transforms.transform(transforms.invert(table.shape.T_world_object), point)
-            if abs(aside[0]) <= 0.25 and abs(aside[1]) <= 0.45:
-                worth = 1.0 - (point[2] - low[2]) / (high[2] - low[2])
-                inside = heap.find_simplex(point[:2]) >= 0
-                total, total_in_heap = total + worth, total_in_heap + worth * inside
-                if occluders.voxels.state_at(point[None]) == UNKNOWN and not occluders.holds(point[None]):
-                    wanted[tuple(point.round(6))] = (worth, worth * inside)
-        found = {tuple(p.round(6)): w for p, w in zip(samples.points_world, samples.weights, strict=True)}
-        assert found.keys() == wanted.keys()
-        weights = [SPACE_WEIGHT * a / total + b / total_in_heap for a, b in wanted.values()]
-        np.testing.assert_allclose([found[p] for p in wanted], weights)
-        assert 0.1 < sum(b > 0.0 for _, b in wanted.values()) / len(wanted) < 0.9
-        assert samples.names == (SPACE,)
-        assert not samples.normals_world.any()
-        assert len(space_samples(self.GRAPH, self.OCCLUDERS).weights) == 0, "all has been seen"
-        assert space_samples(SupportGraph((TABLE,)), self.OCCLUDERS).names == ()
-
-
-def seen_in_a_corner(x, y, z):
-    return (x < 0.12) | (y > -0.02) | (z > 0.83)
 
 
 @pytest.mark.parametrize("name", BUILT_IN)

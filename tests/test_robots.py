@@ -57,19 +57,6 @@ class TestFloorGrid:
         flat, high = box((0.0, 0.0, 0.005), (1.0, 1.0, 0.005)), box((0.0, 0.0, 3.0), (1.0, 1.0, 0.5))
         assert floor(flat, high).free.all()
 
-    def test_path_length_in_the_open_is_the_octile_distance(self):
-        grid = floor(TABLE)
-        paths = grid.paths_from((-1.975, -1.975))
-        ends = np.array([[-0.975, -1.975], [-1.475, -1.475], [-1.975, -1.975], [-1.975, -1.465]])
-        lengths = [1.0, np.hypot(0.5, 0.5), 0.0, 0.51]
-        np.testing.assert_allclose(paths.lengths(ends), lengths, atol=1e-9)
-
-    def test_the_way_leads_around_a_wall(self):
-        grid = floor(box((0.0, 0.0, 1.0), (0.05, 2.0, 1.0)))
-        length = grid.paths_from((-1.0, 0.0)).lengths(np.array([[1.0, 0.0]]))[0]
-        shortest = 2.0 * np.hypot(1.0 - 0.05, 2.0 + 0.35) + 0.1
-        assert shortest - 0.15 < length < 1.15 * shortest
-
     def test_obstacles_are_grown_by_the_footprint_from_boxes_and_from_a_map(self):
         occupied = np.zeros((80, 100), dtype=bool)
         occupied[30:40, 50:60] = True

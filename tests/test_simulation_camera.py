@@ -58,17 +58,6 @@ def test_points_lie_on_the_shapes_their_labels_name(clutter):
     assert (np.einsum("hwi,hwi->hw", view.points_camera, view.normals_camera)[view.valid] < 1e-9).all()
 
 
-def test_the_default_sensor_sees_the_table_at_its_depth_straight_down():
-    T = transforms.look_at((0.2, 0.3, 1.7), (0.2, 0.3, 0.7))
-    view = SimulatedCamera(table_scene()).capture(T)
-    assert view.depth.shape == (480, 640)
-    np.testing.assert_array_equal(view.K, [[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
-    on_table = np.abs(transforms.transform(T, view.points_camera)[..., 2] - 0.7) < 1e-6
-    assert on_table.sum() > 1000
-    np.testing.assert_allclose(view.depth[on_table], 1.0, atol=1e-6)
-    assert (view.labels[on_table] == 0).all()
-
-
 def test_group_3_is_not_seen_and_nothing_is_nothing():
     cover = '<geom type="box" size="0.3 0.3 0.3" pos="0 0 1.1" group="{}" contype="0" conaffinity="0"/>'
     T = transforms.look_at((-1.2, 0.0, 1.3), (0.0, 0.0, 0.8))
