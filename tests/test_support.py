@@ -21,7 +21,7 @@ from caryatid.geometry.transforms import rigid
 from caryatid.graph import SceneObject
 from caryatid.support.contacts import find_contacts, find_gap
 from caryatid.support.equilibrium import support_forces
-from caryatid.support.plausibility import drawn, reconcile
+from caryatid.support.plausibility import closing, drawn, reconcile
 from caryatid.support.relations import explain, infer, predict_removal
 from caryatid.support.stability import contact_patch, ground_outline
 
@@ -600,6 +600,21 @@ class TestReconcile:
         np.testing.assert_array_equal(reconcile(unknown, PLAUSIBLE)[1].centre_world, (0, 0, 0.045))
         sure = [SURFACE, thing(1, (0, 0, 0.048), unsure(0.01))]
         assert reconcile(sure, replace(PLAUSIBLE, rounds=0))[1] is sure[1]
+
+    def test_gaps_close_as_the_dense_filter_says(self):
+        rng, count, objects = np.random.default_rng(0), 50, 27
+        first = rng.integers(0, objects - 1, count)
+        pairs = np.stack([first, first + rng.integers(1, objects - first)], axis=1)
+        rows, gaps = rng.normal(size=(count, 2, 9)), rng.normal(0.0, 0.003, count)
+        variance = rng.uniform(0.0, 1e-5, (objects, 9))
+        variance[0] = 0.0
+        J = np.zeros((count, objects, 9))
+        for k, pair in enumerate(pairs):
+            J[k, pair] = rows[k]
+        J = J.reshape(count, -1)
+        scatter = (J * variance.ravel()) @ J.T + 1e-6 * np.eye(count)
+        expected = variance * (J.T @ np.linalg.solve(scatter, gaps)).reshape(objects, 9)
+        np.testing.assert_allclose(closing(pairs, rows, variance, gaps, 1e-6), expected, atol=1e-12)
 
     def test_the_correction_moves_with_the_scene(self):
         objects = [
