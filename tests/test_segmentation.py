@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from raycast import TABLE, K, from_the_side, table_scene
+from raycast import TABLE, from_the_side, table_scene
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
@@ -149,29 +149,6 @@ def test_the_area_of_a_segment_does_not_depend_on_the_spacing_of_points(spacing)
     assert set(labels[len(points[0]) :]) == {0}
 
 
-def bowl(T_world_camera, radius=0.09, rim=0.07):
-    """A bowl, thin as a shell, upside up on the table: part of a sphere below its rim."""
-    view = table_scene(T_world_camera)
-    v, u = np.mgrid[0:480, 0:640].astype(np.float64)
-    rays = transforms.rotate(
-        T_world_camera, np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
-    )
-    eye = T_world_camera[:3, 3]
-    towards = eye - np.array([0.0, 0.0, TABLE + radius])
-    square, half = np.sum(rays**2, axis=-1), rays @ towards
-    root = half**2 - square * (towards @ towards - radius**2)
-    depth = view.depth.copy()
-    with np.errstate(invalid="ignore"):
-        for sign in (1.0, -1.0):
-            hit = (-half + sign * np.sqrt(root)) / square
-            height = eye[2] + hit * rays[..., 2] - TABLE
-            depth = np.where((root > 0) & (height < rim) & (hit < depth), hit, depth)
-    labels = (np.abs(depth - view.depth) > 1e-4).astype(np.int32)
-    inverse = 1.0 / np.where(depth > 0, depth, np.inf) + 0.001 * np.random.default_rng(0).normal(size=u.shape)
-    depth = np.where(depth > 0, 1.0 / np.maximum(inverse, 0.1), 0.0)
-    return replace(view, depth=depth.astype(np.float32), labels=labels)
-
-
 def solid(y, z, *extents, x=0.0):
     """A box; z is over the table [m]."""
     return np.array([x, y, TABLE + z]), np.array(extents)
@@ -203,11 +180,6 @@ def test_each_object_is_one_part(name, sigma):
     assert labels.dtype == np.int32
     assert found(labels, view.labels) == (objects, objects, objects)
     assert np.mean(labels[view.labels == 0] > 0) < 0.005
-
-
-def test_the_inside_of_a_bowl_belongs_to_the_bowl():
-    view = bowl(from_the_side(distance=0.9))
-    assert found(parts(view), view.labels) == (1, 1, 1)
 
 
 RED, BLUE = np.array([200, 30, 30], np.uint8), np.array([30, 30, 200], np.uint8)

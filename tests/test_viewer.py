@@ -15,7 +15,6 @@ import pytest
 from browser import Tab
 from conftest import SMALL, run_command
 from PIL import Image
-from shapely.geometry import MultiPoint, Point
 
 from caryatid import InputError, Scene
 from caryatid.errors import PlanningError
@@ -154,7 +153,7 @@ def test_arrows_begin_and_end_beside_names_however_far_behind_each_other(page, s
 
 
 def test_names_are_on_what_can_be_seen_of_their_objects():
-    """Seen from anywhere, a name is on its object's surface, inside its outline, and nothing is before it."""
+    """Seen from anywhere, a name is on its object's surface, and nothing is before it."""
     rng, found = np.random.default_rng(5), 0
     for _ in range(8):
         places = [transforms.rigid(np.eye(3), rng.uniform(-0.2, 0.2, 3)) for _ in range(6)]
@@ -164,7 +163,6 @@ def test_names_are_on_what_can_be_seen_of_their_objects():
         surfaces = [shape.surface(SPACING)[0] for shape in shapes]
         owner = np.repeat(np.arange(6), [len(points) for points in surfaces])
         eye = 1.2 * transforms.unit(rng.normal(size=3))
-        T_eye_world = transforms.invert(transforms.look_at(eye, np.zeros(3)))
         for number, at in visible_points(np.concatenate(surfaces), owner, eye).items():
             found += 1
             assert abs(shapes[number].signed_distance(at[None])[0]) < 1e-3
@@ -172,13 +170,6 @@ def test_names_are_on_what_can_be_seen_of_their_objects():
             for shape in shapes:  # in up to 1 cm, the coarseness of what is seen
                 inside = shape.signed_distance(way) < -0.012
                 assert not inside.any()
-            outline = transforms.transform(T_eye_world, shapes[number].outline())
-            x, y, z = transforms.transform(T_eye_world, at[None])[0]
-            assert (
-                MultiPoint(outline[:, :2] / outline[:, 2:])
-                .convex_hull.buffer(1e-6)
-                .covers(Point(x / z, y / z))
-            )
         alone = visible_points(surfaces[0], np.zeros(len(surfaces[0]), dtype=int), eye)[0]
         assert np.linalg.norm(np.cross(alone - eye, places[0][:3, 3] - eye)) < 0.02
     assert found > 30
