@@ -231,13 +231,6 @@ def write_pcd(tmp_path):
 
 
 @pytest.fixture
-def leftovers(tmp_path):
-    """Names in the test's folder, hidden ones too, that were not there when this was asked for."""
-    before = set(os.listdir(tmp_path))
-    return lambda: set(os.listdir(tmp_path)) - before
-
-
-@pytest.fixture
 def refused(tmp_path, capsys):
     """Run a command that must fail in one line that names its source, and leave nothing behind."""
 

@@ -24,32 +24,6 @@ def without_pose(view):
     return replace(view, T_world_camera=None)
 
 
-def test_given_labels_stay_and_the_table_gets_its_own():
-    observation = observation_of(VIEW, "labels")
-    given = VIEW.labels.ravel()[observation.pixels]
-    np.testing.assert_array_equal(observation.labels[given > 0], given[given > 0])
-    table = observation.cloud.points_world[observation.labels == SUPPORT_LABEL]
-    assert (np.abs(table[:, 2] - TABLE_TOP) < CONFIG.surface.tolerance).all()
-    assert np.abs(table[:, 2] - TABLE_TOP).mean() < 0.001
-    on_table = (np.abs(observation.cloud.points_world[:, 2] - TABLE_TOP) < 0.001) & (given == 0)
-    assert (observation.labels[on_table] == SUPPORT_LABEL).mean() > 0.98
-    floor = observation.cloud.points_world[:, 2] < 0.1
-    assert floor.sum() > 100
-    assert (observation.labels[floor] == 0).all()
-
-
-def test_what_is_below_the_known_table_is_not_looked_at():
-    first = observation_of(VIEW, "labels")
-    again = observation_of(VIEW, "labels", known=first.surface)
-    assert again.cloud.points_world[:, 2].min() > TABLE_TOP - 0.1
-    shared = np.isin(first.pixels, again.pixels)
-    np.testing.assert_array_equal(first.pixels[shared], again.pixels)
-    np.testing.assert_allclose(first.cloud.points_world[shared], again.cloud.points_world)
-    above = first.cloud.points_world[:, 2] > TABLE_TOP - 0.04
-    assert shared[above].all()
-    assert (first.labels[shared] == again.labels).mean() > 0.999
-
-
 def test_labelled_points_below_the_known_table_are_kept():
     known = observation_of(VIEW).surface
     floor = observation_of(VIEW, "labels")

@@ -63,18 +63,6 @@ def test_the_table_is_found_not_the_floor(sigma):
     np.testing.assert_allclose(sorted(surface.shape.extents), [0.04, 0.6, 0.9], atol=0.03)
 
 
-def test_the_surface_box_has_the_table_top_as_its_top_face():
-    surface = surface_of(table_scene(from_the_side(azimuth=33.0)))
-    T = surface.shape.T_world_object
-    top = T[:3, 3] + T[:3, 2] * surface.shape.extents[2] / 2.0
-    assert abs(surface.height(top)) < 1e-9
-    np.testing.assert_allclose(T[:3, 2], surface.normal_world, atol=1e-9)
-    assert surface.shape.signed_distance(surface.outline_world).max() < 1e-6
-    assert np.abs(surface.height(surface.outline_world)).max() < 1e-9
-    turn = np.cross(np.roll(surface.outline_world, -1, axis=0) - surface.outline_world, UP)
-    assert (np.einsum("ij,ij->i", turn, surface.outline_world - surface.point_world) > 0).all()
-
-
 @pytest.mark.parametrize("up", [UP, None])
 def test_no_surface_is_an_error_that_says_so(up):
     rng = np.random.default_rng(0)
