@@ -96,12 +96,8 @@ def test_a_session_over_http_is_the_session(client, views):
     options = {"segmentation": "labels", "seed": 0, "planner": "support"}
     assert client.get("/sessions/a").json() == {"name": "a", "views": 2, **options}
 
-    following = client.get("/sessions/a/next").json()
-    assert following["view"] == 2
-    assert np.array(following["T_world_camera"]).shape == (4, 4)
-    assert len(following["platform"]) == 3
-    assert following["waypoints"][-1]["platform"] == following["platform"]
-    assert following["why"]
+    with Session.open(client.pool.folder / "a", read_only=True) as session:
+        assert client.get("/sessions/a/next").json() == session.next().to_json()
     reach = {"T_world_camera": [v.pose.tolist() for v in views], "path_length": [0.0, 9.0, 9.0]}
     chosen = client.post("/sessions/a/next", json=reach).json()
     assert chosen["T_world_camera"] == reach["T_world_camera"][chosen["candidate"]]
@@ -118,8 +114,8 @@ def test_a_session_over_http_is_the_session(client, views):
         left = client.delete("/sessions/a/views/last").json()
     assert left == {"views": 2, "graph": graph_of(views[:2])}
 
-    assert client.delete("/sessions/a/views/last").json() == {"views": 1, "graph": graph_of(views[:1])}
-    assert client.delete("/sessions/a/views/last").json()["views"] == 0
+    for number in (1, 0):
+        assert client.delete("/sessions/a/views/last").json()["views"] == number
     assert client.delete("/sessions/a/views/last").status_code == 409
 
 
