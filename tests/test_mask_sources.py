@@ -51,10 +51,9 @@ def boxed(tmp_path):
     """A model whose masks are the boxes it is prompted with."""
     rows = np.arange(HEIGHT, dtype=np.float32)[None, :, None]
     columns = np.arange(WIDTH, dtype=np.float32)[None, None, :]
-    picks = [(f"pick{k}", np.array([k])) for k in range(4)]
-    nodes = [helper.make_node("Gather", ["boxes", f"pick{k}"], [f"flat{k}"], axis=1) for k in range(4)]
-    nodes += [helper.make_node("Unsqueeze", [f"flat{k}", "last"], [f"side{k}"]) for k in range(4)]
-    nodes += [
+    nodes = [
+        helper.make_node("Unsqueeze", ["boxes", "one"], ["sides"]),
+        helper.make_node("Split", ["sides"], [f"side{k}" for k in range(4)], axis=2),
         helper.make_node("GreaterOrEqual", ["columns", "side0"], ["right"]),
         helper.make_node("GreaterOrEqual", ["rows", "side1"], ["below"]),
         helper.make_node("Less", ["columns", "side2"], ["left"]),
@@ -64,7 +63,7 @@ def boxed(tmp_path):
         helper.make_node("And", ["across", "along"], ["masks"]),
     ]
     inputs = {"image": (1, 3, HEIGHT, WIDTH), "boxes": ("N", 4)}
-    constants = [*picks, ("rows", rows), ("columns", columns), ("last", np.array([2]))]
+    constants = [("rows", rows), ("columns", columns), ("one", np.array([1]))]
     return write_model(tmp_path / "boxed.onnx", nodes, inputs, constants)
 
 

@@ -506,17 +506,6 @@ class TestReconcile:
         assert moved.shape is not sunk.shape
         assert same is right[2]
 
-    def test_an_overlap_is_taken_from_the_side_nobody_saw(self):
-        seen = thing(1, (0.0, 0, 0.05), unsure(0.0005))
-        guessed = thing(2, (0.092, 0, 0.05), unsure(0.0005, low_x=0.02))
-        _, first, second = reconcile([SURFACE, seen, guessed], PLAUSIBLE)
-        assert find_gap(first.shape, second.shape) > -0.0015
-        np.testing.assert_allclose(first.shape.extents, seen.shape.extents, atol=3e-4)
-        assert second.shape.extents[0] == pytest.approx(0.092, abs=0.0015)
-        assert second.centre_world[0] + second.shape.extents[0] / 2.0 == pytest.approx(0.142, abs=3e-4)
-        assert not first.doubt
-        assert not second.doubt
-
     @pytest.mark.parametrize(
         "shape", [cube(*HOVERING), Cylinder(at(*HOVERING), 0.03, 0.1), Sphere(at(*HOVERING), 0.05)]
     )
