@@ -108,18 +108,6 @@ def test_the_newest_view_alone_is_fitted_on_demand(models):
     assert [o.label for o in models.objects()] == [2]
 
 
-def test_an_object_that_could_not_be_divided_is_left_alone_until_it_has_grown(models, monkeypatch):
-    tried = []
-    monkeypatch.setattr("caryatid.objects.models.split", lambda *a, **k: tried.append(len(a[0].points)))
-    models.fit_all(models.add(observation_of((1,), (CRATE,)), 0))
-    assert models.divide({1}) == set()
-    assert models.divide({1}) == set()
-    assert len(tried) == 1
-    models.fit_all(models.add(observation_of((1,), (CRATE,), (1.2, 0.6, 1.8)), 0))
-    models.divide({1})
-    assert len(tried) == 2
-
-
 def test_a_pair_is_looked_at_again_when_one_of_them_has_been_divided(models, monkeypatch):
     models.fit_all(models.add(observation_of((1, 1)), 0))
     models.fit_all(models.add(observation_of((2,), (CRATE,), seed=3), 0))
