@@ -11,7 +11,7 @@ from caryatid.fitting.primitives import FitFailure
 from caryatid.geometry import transforms
 from caryatid.objects.models import ObjectModels, ObjectPoints
 from caryatid.segmentation.observation import Observation
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud
+from caryatid.sensing.views import Cloud
 from caryatid.sensing.voxel_map import VoxelMap
 
 CRATE, CAN = box((0.0, 0.0, 0.8), (0.16, 0.12, 0.1)), cylinder((0.0, 0.0, 0.91), 0.03, 0.12)
@@ -102,12 +102,6 @@ def test_a_shape_that_the_table_would_fill_is_not_taken(models, table, kind):
     assert models.objects()[0].shape.kind == kind
 
 
-def test_the_newest_view_alone_is_fitted_on_demand(models):
-    models.fit_all(models.add(observation_of((1, 2)), 0))
-    models.fit_newest(models.add(observation_of((2,), (CAN,)), 0))
-    assert [o.label for o in models.objects()] == [2]
-
-
 def test_a_pair_is_looked_at_again_when_one_of_them_has_been_divided(models, monkeypatch):
     models.fit_all(models.add(observation_of((1, 1)), 0))
     models.fit_all(models.add(observation_of((2,), (CRATE,), seed=3), 0))
@@ -130,32 +124,6 @@ def cloud(count, label, at=0.0):
 
 def add(points, cloud, view):
     points.add(cloud, cloud.labels, view)
-
-
-def two_views():
-    points = ObjectPoints()
-    for view, at in enumerate((0.0, 100.0)):
-        for label, count in ((1, 4), (3, 6), (SUPPORT_LABEL, 5)):
-            add(points, cloud(count, label, at), view)
-    return points
-
-
-def test_views_add_up_and_dividing_and_merging_keep_every_point():
-    points = two_views()
-    assert (points.objects, points.labels_used) == ([1, 3], 3)
-    assert points.newest(3).points_world[:, 0].tolist() == list(range(100, 106))
-    assert set(points.everything().labels) == {1, 3, SUPPORT_LABEL}
-    assert len(points.of(7)) == 0
-    before, groups = points.of(3).points_world, np.tile([0, 1, 2], 4)
-    assert points.divide(3, groups) == [3, 4, 5]
-    for number, name in enumerate((3, 4, 5)):
-        np.testing.assert_array_equal(points.of(name).points_world, before[groups == number])
-        assert set(points.of(name).labels) == {name}
-    points.merge(5, 1)
-    assert points.objects == [1, 3, 4]
-    assert (len(points.of(1)), set(points.of(1).labels)) == (12, {1})
-    assert points.divide(1, np.arange(12) % 2) == [1, 6], "a label given up is not given again"
-    assert len(points.everything()) == 30
 
 
 def test_many_views_leave_no_more_than_the_newest_points_of_a_place():

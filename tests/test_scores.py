@@ -8,14 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import step_of
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from synthetic import box, sphere, table_object, thing
 
 from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.evaluation import as_scene, evaluate_run, score, score_masks
-from caryatid.evaluation.scores import Forecast, average_precision, mask_ious
+from caryatid.evaluation.scores import Forecast, average_precision
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
 from caryatid.graph import SceneObject, Support, SupportGraph
@@ -174,19 +172,6 @@ def test_without_a_true_table_the_extracted_one_is_wrong():
     result = masked(SEEN, VERTICES[1:], frozenset({("object5", "object7")}))
     assert result.vertex_precision == pytest.approx(2 / 3)
     assert result.edge_precision == 0.5
-
-
-@given(st.integers(0, 10_000))
-@settings(max_examples=15, deadline=None)
-def test_mask_iou_is_what_sets_say(seed):
-    rng = np.random.default_rng(seed)
-    mine, theirs = ([rng.integers(0, 5, shape) for shape in ((6, 7), (4, 3))] for _ in range(2))
-    iou = mask_ious(mine, theirs, [1, 2, 3], [4, 1])
-    a, b = (np.concatenate([image.ravel() for image in images]) for images in (mine, theirs))
-    for i, k in enumerate((1, 2, 3)):
-        for j, m in enumerate((4, 1)):
-            union = ((a == k) | (b == m)).sum()
-            assert iou[i, j] == pytest.approx(((a == k) & (b == m)).sum() / max(union, 1))
 
 
 def write_run(folder, *views):
