@@ -126,6 +126,19 @@ def add(points, cloud, view):
     points.add(cloud, cloud.labels, view)
 
 
+def test_dividing_and_merging_keep_every_point_and_never_give_a_label_again():
+    points = ObjectPoints()
+    for label, count in ((1, 4), (3, 12)):
+        add(points, cloud(count, label), 0)
+    before, groups = points.of(3).points_world, np.tile([0, 1, 2], 4)
+    assert points.divide(3, groups) == [3, 4, 5]
+    for number, name in enumerate((3, 4, 5)):
+        np.testing.assert_array_equal(points.of(name).points_world, before[groups == number])
+    points.merge(5, 1)
+    assert (points.objects, len(points.of(1))) == ([1, 3, 4], 8)
+    assert points.divide(1, np.arange(8) % 2) == [1, 6]
+
+
 def test_many_views_leave_no_more_than_the_newest_points_of_a_place():
     points = ObjectPoints()
     for view in range(9):
