@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from synthetic import box, config_for, edges, look_from, model_of, simulated_scene, simulated_views, vertices
 
+from caryatid.config import Config, RegistrationConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.objects.changes import appeared
@@ -63,6 +64,12 @@ def test_what_somebody_moved_keeps_its_name_and_its_size(segmentation, state):
     np.testing.assert_allclose(now.centre_world - ball.centre_world, (0.0, 0.12, 0.0), atol=0.01)
     np.testing.assert_allclose(now.shape.extents, ball.shape.extents, atol=0.01)
     assert len(scene.graph.objects) == 6
+
+
+def test_errors_of_poses_that_are_used_as_reported_are_no_changes():
+    config = replace(Config(), registration=RegistrationConfig(enabled=False))
+    scene = model_of(simulated_views("bridge", tuple(50.0 * k for k in range(10)), "carmine"), config)
+    assert not scene.changes
 
 
 @pytest.mark.parametrize("segmentation", ["labels", "auto"])

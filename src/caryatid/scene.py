@@ -507,12 +507,14 @@ class Scene(Pictured):
     def _changes_seen(self, observation: Observation, named: bool) -> tuple[dict[str, str], dict[int, str]]:
         """Find objects that changed, and delete them before anything is added.
 
+        Only a registered view can show a change: an error of its pose looks the same.
+
         Returns:
             Ids of the objects that are no longer in place, and labels of the segments in space that was free;
             each with a reason.
         """
         view, voxels, registration = observation.view, self.voxels, self._registration
-        if view is None or voxels is None or (registration and not registration.aligned):
+        if view is None or voxels is None or registration is None or not registration.aligned:
             return {}, {}
         missing = self._detector.missing(view, self._surfaces())
         new = dict[int, str]()

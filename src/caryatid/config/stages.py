@@ -105,7 +105,7 @@ class RegistrationConfig:
     """Registration of views to each other, starting from the reported poses."""
 
     enabled: bool = True
-    """Whether poses are refined."""
+    """Whether poses are refined, and changes between views detected."""
     translation: Positive = 0.01
     """Expected error of a reported position, per axis [m]; about twice the usual error."""
     rotation: Positive = 0.5
