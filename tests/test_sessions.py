@@ -141,6 +141,22 @@ def test_a_view_without_a_table_is_kept_until_one_shows_it(folder, views, graph_
         assert graph_text(session.graph) == graph_text(added.graph)
 
 
+def test_a_kept_view_that_does_not_fit_later_is_ignored_also_after_opening(folder, views):
+    """The first view is tilted too much to show a table, and the wall is far from it."""
+    first, centre = views[0], np.array([0.0, 0.0, 0.75])
+    R = transforms.rotation_from_vector((0.0, np.radians(11.0), 0.0))
+    tilted = replace(first, T_world_camera=transforms.rigid(R, centre - R @ centre) @ first.pose)
+    with Session.begin(folder, segmentation="labels", seed=7) as session:
+        for view in (tilted, wall_of(first), views[1], views[2]):
+            session.add(view)
+        assert (session.views, session.scene.views, len(session.scene.waiting)) == (4, 3, 0)
+        poses, graph = session.scene.T_world_cameras, graph_text(session.graph)
+    shutil.rmtree(folder / "state")
+    with Session.open(folder) as session:
+        assert graph_text(session.graph) == graph
+        np.testing.assert_array_equal(session.scene.T_world_cameras, poses)
+
+
 def test_looking_on_stops_when_a_view_changes_nothing(folder, views):
     settings = replace(Config(), active=replace(Config().active, stop="unchanged"))
     with Session.begin(folder, settings, segmentation="labels") as session:
@@ -218,8 +234,24 @@ def test_a_snapshot_of_other_views_does_not_count(begun, views, graph_after):
         assert graph_text(session.graph) == graph_after(0, 2)
 
 
+def test_reports_of_views_that_are_gone_are_not_applied_to_others(begun, views):
+    with Session.open(begun) as session:
+        session.take("o2")
+    shutil.rmtree(begun / "views/000001")
+    with pytest.raises(InputError, match="some belong to missing views; restore these views"):
+        Session.open(begun)
+
+
 @pytest.mark.parametrize(("code", "processed"), [("the same", 0), ("other", 2)])
-def test_opening_processes_views_again_only_with_other_code(begun, monkeypatch, code, processed):
+@pytest.mark.parametrize("segmentation", ["labels", "auto"])
+def test_opening_processes_views_again_only_with_other_code(
+    begun, folder, views, monkeypatch, code, processed, segmentation
+):
+    if segmentation == "auto":
+        shutil.rmtree(folder)
+        with Session.begin(folder, segmentation="auto") as session:
+            for view in views[:2]:
+                session.add(view)
     if code == "other":
         monkeypatch.setattr("caryatid.sessions.session.fingerprint", lambda: "other")
     updates, original = [], Scene.update
@@ -504,9 +536,16 @@ def test_a_session_is_not_begun_where_something_is(begun, tmp_path):
     with FileLock(tmp_path / "soon/lock"), pytest.raises(SessionBusyError):
         Session.begin(tmp_path / "soon")
     assert not (tmp_path / "soon/session.json").exists()
-    with pytest.raises(InputError, match="unknown planner 'juggler'"):
-        Session.begin(tmp_path / "new", planner="juggler")
-    assert not (tmp_path / "new").exists()
+    for wrong in ({"planner": "juggler"}, {"seed": -1}, {"segmentation": "magic"}):
+        with pytest.raises(InputError):
+            Session.begin(tmp_path / "new", **wrong)
+        assert not (tmp_path / "new").exists()
+    (begun / "session.json").unlink()
+    with pytest.raises(SessionConflictError):
+        Session.begin(begun)
+    with Session.begin(tmp_path / "new", seed=np.int64(3)):
+        pass
+    assert Session.open(tmp_path / "new").beginning.seed == 3
 
 
 BEGUN_OTHERWISE = {

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,11 +205,22 @@ class ObjectModels:
 
     def copy(self) -> ObjectModels:
         """Return an independent copy; clouds, trees and shapes are shared."""
-        other = copy.copy(self)
+        other = object.__new__(ObjectModels)
+        vars(other).update(vars(self))
         for name, value in vars(self).items():
             if isinstance(value, ObjectPoints | dict | list | set):
                 setattr(other, name, value.copy())
         return other
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state to store, with the points of search trees in place of the trees."""
+        return vars(self) | {
+            "_segments": [(np.asarray(tree.data), labels) for tree, labels in self._segments]
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        segments = [(cKDTree(points), labels) for points, labels in state["_segments"]]
+        vars(self).update(state | {"_segments": segments})
 
     def forget(self, labels: set[int]) -> None:
         """Drop the points and shapes of some objects."""

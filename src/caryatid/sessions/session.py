@@ -251,16 +251,19 @@ class Session:
             ignore: Pixels (H, W) to ignore in every view, such as those of the robot's arm, or None.
 
         Raises:
-            InputError: The folder is not empty or cannot be written, or the planner or robot is unknown.
+            InputError: The folder is not empty or cannot be written, the planner or robot is unknown, or an
+                option of the scene is invalid.
         """
         make_planner(planner)
         find_robot(robot)
         mask = None if ignore is None else png(np.asarray(ignore, dtype=np.uint8))
-        beginning = Beginning(segmentation, seed, planner, robot, config or Config(), mask)
+        Scene(config, segmentation=segmentation, seed=seed)  # refuse what a scene refuses
+        beginning = Beginning(segmentation, int(seed), planner, robot, config or Config(), mask)
         folder = Path(path)
         with write_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            taken = any(p.name not in ("views", "lock") and p.name[0] != "." for p in folder.iterdir())
+            known = *folder.iterdir(), *folder.glob("views/*")
+            taken = any(p.name not in ("views", "lock") and p.name[0] != "." for p in known)
         path = folder / "session.json"
         conflict = "already contains a session or other files", "use that session, or give a new folder"
         if taken:
@@ -292,6 +295,8 @@ class Session:
         folder = Path(path)
         beginning = Beginning.read(folder / "session.json")
         if read_only:
+            with suppress(InputError):  # a writer may have undone a view just now
+                return cls(folder, beginning, None)
             return cls(folder, beginning, None)
         with ExitStack() as failure:
             session = cls(folder, beginning, failure.enter_context(_locked(folder / "lock")))
@@ -489,6 +494,9 @@ class Session:
         records = [CameraRecord.read(folder / "camera.json") for folder in folders]
         remedy = "delete this report and all later ones from the session folder"
         reports = [parse_json(Report, read_json(path, remedy), path, remedy) for path in files]
+        if self._lock is not None and any(report.after > len(records) for report in reports):
+            reason, remedy = "some belong to missing views", "restore these views, or delete these reports"
+            raise InputError(self.path / "reports", reason, remedy)
         events: list[Event] = []
         # Reports of views that another process has just added are left to the next reader.
         for number in range(len(records) + 1):
@@ -508,11 +516,13 @@ class Session:
         b = self.beginning
         done, scene = self._read_snapshot(events)
         scene = scene or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
+        views = sum(isinstance(event, CameraRecord) for event in events[:done])
         for number, event in enumerate(events[done:], start=done):
             if isinstance(event, Report):
                 event.apply(scene)
             else:
-                scene.update(self._decoded(_given(scene)))
+                scene.update(self._decoded(views))
+                views += 1
             if self._lock is not None:
                 self._write_snapshot(scene, events[: number + 1])
         return scene
@@ -524,8 +534,7 @@ class Session:
                 content = self._snapshot(number).read_bytes()
                 if content[:32] == self._seal(events[:number], content[32:]):
                     scene = _Unpickler(io.BytesIO(content[32:])).load()
-                    views = sum(isinstance(event, CameraRecord) for event in events[:number])
-                    if isinstance(scene, Scene) and _given(scene) == views:
+                    if isinstance(scene, Scene):
                         return number, scene
         return 0, None
 
@@ -548,11 +557,6 @@ class Session:
         told = (e.digest if isinstance(e, CameraRecord) else e.to_json().decode() for e in events)
         made_of = " ".join((fingerprint(), self.beginning.to_json(), *told))
         return hashlib.sha256(made_of.encode() + b"\0" + payload).digest()
-
-
-def _given(scene: Scene) -> int:
-    """Number of views that a scene was updated with."""
-    return scene.views + len(scene.waiting)
 
 
 def _locked(path: Path) -> FileLock:
