@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from synthetic import box, config_for, edges, look_from, model_of, simulated_scene, simulated_views, vertices
 
 from caryatid.config import Config, RegistrationConfig
@@ -70,6 +71,15 @@ def test_errors_of_poses_that_are_used_as_reported_are_no_changes():
     config = replace(Config(), registration=RegistrationConfig(enabled=False))
     scene = model_of(simulated_views("bridge", tuple(50.0 * k for k in range(10)), "carmine"), config)
     assert not scene.changes
+
+
+def test_a_view_of_one_new_object_and_nothing_else_adds_it_to_fused_graphs():
+    first, other = simulated_views("tower")[:2]
+    hidden, own = first.labels == 1, ndimage.binary_erosion(other.labels == 1, iterations=2)
+    before = replace(first, depth=np.where(hidden, 0, first.depth), labels=first.labels * ~hidden)
+    views = before, replace(other, depth=np.where(own, other.depth, 0))
+    config = replace(config_for("sg"), registration=RegistrationConfig(enabled=False))
+    assert "o1" in vertices(model_of(views, config).graph)
 
 
 @pytest.mark.parametrize("segmentation", ["labels", "auto"])

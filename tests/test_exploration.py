@@ -7,14 +7,15 @@ from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
-from conftest import refusal
+from conftest import refusal, wall_of
 from synthetic import FEW_VIEWS, model_of, simulated_scene, simulated_views
 
-from caryatid.errors import InputError, PlanningError
+from caryatid.errors import InputError, NoSurfaceError, PlanningError
 from caryatid.exploration import Explorer, explore, next_best_view
 from caryatid.geometry import transforms
+from caryatid.io import read_recording, write_recording
 from caryatid.io.graph_json import graph_text
-from caryatid.robots.recording import RecordingRobot
+from caryatid.robots.recording import RecordingCamera, RecordingRobot
 from caryatid.scene import Scene
 from caryatid.simulation.setup import make_simulation
 from caryatid.steps import RunWriter, read_run, read_steps
@@ -128,7 +129,7 @@ def test_a_person_may_choose_another_view_and_another_planner():
     explorer.use_planner("farthest")
     other = explorer.plan()
     assert other.decision.index != planned.decision.index
-    index = (other.decision.index + 7) % len(other.candidates)
+    index = np.int64((other.decision.index + 7) % len(other.candidates))
     chosen = explorer.choose(index)
     assert chosen.decision.why == "chosen by hand"
     assert chosen.decision.score == chosen.decision.saliency - chosen.decision.cost
@@ -154,6 +155,30 @@ def test_views_may_be_handed_in_without_camera_or_robot():
     assert steps[-1].angle_travelled > steps[1].angle_travelled > 0.0
     with pytest.raises(PlanningError, match="no robot"):
         explorer.plan()
+
+
+def test_a_kept_view_counts_as_taken_from_where_it_was():
+    first, other = simulated_views("tower")[:2]
+    wall = wall_of(first)
+    robot = RecordingRobot([wall.pose, other.pose])
+    explorer = Explorer(robot=robot)
+    with pytest.raises(NoSurfaceError):
+        explorer.look(wall)
+    robot.move_to(other.pose)
+    kept, step = explorer.looks(other)
+    expected = step.sphere.direction_of(np.stack([wall.pose, other.pose]))
+    np.testing.assert_allclose(step.visited, expected, atol=1e-9)
+    assert kept.robot is None
+    assert step.angle_travelled == pytest.approx(np.arccos(expected[0] @ expected[1]))
+
+
+def test_a_recording_from_one_place_is_shown_frame_by_frame(tmp_path):
+    views = [replace(view, name="") for view in simulated_views("tower")[:2]]
+    empty = replace(views[0], labels=np.where(views[0].labels == 4, 0, views[0].labels))
+    write_recording(tmp_path / "rec", [*views, empty])
+    camera = RecordingCamera(read_recording(tmp_path / "rec"))
+    shown = [camera.capture(view.pose).name for view in (*views, empty, empty)]
+    assert shown == ["rec/000000", "rec/000001", "rec/000002", "rec/000000"]
 
 
 def test_masks_that_would_not_be_used_are_refused():

@@ -203,10 +203,10 @@ class Explorer:
             given = self._masks(given)
         watch.lap("capture")
         for taken in self.scene.updates(given):
-            self.step = self._step(taken, watch.laps["capture"])
+            self.step = self._step(taken, watch.laps["capture"], kept=taken is not given)
             yield self.step
 
-    def _step(self, source: View | Cloud, captured: float) -> Step:
+    def _step(self, source: View | Cloud, captured: float, *, kept: bool) -> Step:
         """The step of the newest view of the scene, with its capture time [s]."""
         scene, robot, before = self.scene, self.robot, self.step
         assert scene.sphere is not None
@@ -215,7 +215,7 @@ class Explorer:
         found = scene.T_world_camera
         if view is not None and found is not None and (robot is None or view.T_world_camera is None):
             view = view.with_pose(found)
-        T_world_camera = found if robot is None else robot.T_world_camera
+        T_world_camera = found if robot is None or kept else robot.T_world_camera
         sphere = view_sphere_of(robot, scene.sphere)
         visited, angle, path = np.zeros((0, 3)), 0.0, 0.0
         if before is not None:
@@ -224,12 +224,12 @@ class Explorer:
                 path += float(np.linalg.norm(view.pose[:3, 3] - before.view.pose[:3, 3]))
         if T_world_camera is not None:
             visited = np.concatenate([visited, sphere.direction_of(T_world_camera)[None]])
-        if len(visited) > 1:
-            angle += float(transforms.angle_between(visited[-2], visited[-1]))
+            if len(visited) > 1:
+                angle += float(transforms.angle_between(visited[-2], visited[-1]))
         return Step(
             scene.views - 1, source.name, view, scene.labels, scene.graph, scene.cloud, sphere, visited,
             None, None, {"capture": captured} | scene.timings, angle, path, None,
-            self._robot_pose(),
+            None if kept else self._robot_pose(),
             tuple(change for change in scene.changes if change.view == scene.views - 1),
         )  # fmt: skip
 
@@ -286,7 +286,10 @@ class Explorer:
         Raises:
             PlanningError: The candidate does not exist, the robot refuses it, or nothing was planned.
         """
-        decision = self._by_hand(chosen) if isinstance(chosen, int) else chosen
+        check_type(
+            "chosen", chosen, (Decision, int, np.integer), "give a decision or the index of a candidate"
+        )
+        decision = chosen if isinstance(chosen, Decision) else self._by_hand(int(chosen))
         robot, T_world_camera = self._moving(), decision.T_world_camera
         refused = refusal_of(robot, T_world_camera)
         if refused is not None:

@@ -215,6 +215,7 @@ class Scene(Pictured):
         if self.voxels is None:
             raise InputError("scene", "has no views", "add a view first")
         label = self._models.put(shape, self.views - 1)
+        self._ids = self._ids | {label: object_id(label)}
         self.voxels = self.voxels.forgotten(self.voxels.within(shape, np.zeros((0, 3))))
         self._reported("added", object_id(label))
         return object_id(label)
@@ -252,7 +253,8 @@ class Scene(Pictured):
         for label, known in self._ids.items():
             if known == object_id:
                 return label
-        return None if self.config.fusion.method == "sg" else int(object_id[1:])
+        label = int(object_id[1:])
+        return None if self.config.fusion.method == "sg" or label in self._ids else label
 
     def _reported(self, kind: ChangeKind, object_id: str) -> None:
         """Record what the robot did, and derive the graph again."""

@@ -111,7 +111,7 @@ def fused_graph(
             last = found[max(found)]
             certain = last.certain if config.method != "sg" else any(s.certain for s in found.values())
             if last.probability is not None:
-                if newest not in found or config.method == "sg":
+                if views and (newest not in found or config.method == "sg"):
                     # A view that did not find it counts 0.
                     likely = sum(found[v].belief for v in views & found.keys()) / len(views)
                     last = replace(last, probability=likely)

@@ -69,9 +69,13 @@ class RecordingCamera:
             remedy = "add cam_R_w2c and cam_t_w2c to each"
             raise InputError(recording.path, "several frames have no poses", remedy)
         self._recording = recording
+        self._shown: set[int] = set()
 
     def capture(self, T_world_camera: Array) -> View:
         """Return the frame recorded nearest to a pose (4, 4)."""
         poses = [f.T_world_camera for f in self._recording.frames]
         distances = [0.0 if T is None else np.abs(T[:3] - T_world_camera[:3]).max() for T in poses]
-        return self._recording.frames[int(np.argmin(distances))].load()
+        nearest = np.flatnonzero(np.array(distances) <= min(distances) + 1e-3).tolist()
+        index = min(nearest, key=lambda i: (i in self._shown, i))
+        self._shown.add(index)
+        return self._recording.frames[index].load()

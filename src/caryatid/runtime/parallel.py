@@ -8,11 +8,12 @@ threads cost more than they save.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cache, partial, wraps
 from pathlib import Path
+from threading import Lock
 from typing import Any, ParamSpec, TypeVar
 
 import numba
@@ -50,10 +51,35 @@ def one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
 
     @wraps(function)
     def limited(*args: P.args, **kwargs: P.kwargs) -> Result:
-        with _blas().limit(limits=1, user_api="blas"):
+        with _blas_limited():
             return function(*args, **kwargs)
 
     return limited
+
+
+_lock = Lock()
+_running: list[list[tuple[Any, int]]] = []
+"""For each function that runs with one BLAS thread: the libraries, and their usual numbers of threads."""
+
+
+@contextmanager
+def _blas_limited() -> Iterator[None]:
+    """Limit BLAS, and restore the numbers of threads from before any function that runs now.
+
+    threadpoolctl lets only one thread change them while it is alive, so every thread restores them.
+    """
+    with _lock:
+        usual = _running[0] if _running else [(library, library.num_threads) for library in _blas()]
+        _running.append(usual)
+    try:
+        for library, _ in usual:
+            library.set_num_threads(1)
+        yield
+    finally:
+        with _lock:
+            _running.pop()
+        for library, number in usual:
+            library.set_num_threads(number)
 
 
 def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
@@ -104,4 +130,6 @@ def _threads(process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS, thread_name_prefix="caryatid")
 
 
-_blas = cache(ThreadpoolController)
+@cache
+def _blas() -> list[Any]:
+    return [c for c in ThreadpoolController().lib_controllers if c.user_api == "blas"]
