@@ -155,6 +155,9 @@ def test_only_objects_can_be_taken_and_only_what_is_rigid_moves(scene):
             scene.removed(object_id)
     with pytest.raises(InputError, match="T"):
         scene.moved("o5", np.diag([2.0, 1.0, 1.0, 1.0]))
+    for size in (60.0, -0.06):
+        with pytest.raises(InputError, match="shape"):
+            scene.added(box((-0.2, -0.2, 0.78), (0.06, 0.06, size)))
     with pytest.raises(InputError, match="add a view first"):
         Scene().added(box((0.0, 0.0, 0.8), (0.1, 0.1, 0.1)))
     assert scene.changes == ()

@@ -104,7 +104,10 @@ def test_the_next_view_can_be_asked_for_alone():
     poses = candidates.T_world_camera
     alone = next_best_view(scene, candidates=poses, path_length=candidates.path_length)
     assert (alone.index, alone.score, alone.waypoints) == (given.index, given.score, ())
+    far = poses.copy()
+    far[:, :3, 3] *= 1000.0
     for wrong, named in (
+        (far, "candidates"),
         ("left", "candidates"),
         (poses[:, :3], "candidates"),
         (2.0 * poses, "candidates[0]"),
@@ -119,6 +122,17 @@ def test_the_next_view_can_be_asked_for_alone():
         next_best_view(scene)
     with pytest.raises(PlanningError, match="has no views"):
         next_best_view(Scene(), stage().robot)
+
+
+def test_a_robot_may_return_poses_alone():
+    class Bare(RecordingRobot):
+        def candidates(self, sphere):
+            return super().candidates(sphere).T_world_camera
+
+    views = simulated_views("tower")
+    robots = (kind([v.pose for v in views]) for kind in (RecordingRobot, Bare))
+    first, second = (next_best_view(model_of(views[:1], FEW_VIEWS), robot) for robot in robots)
+    np.testing.assert_array_equal(first.T_world_camera, second.T_world_camera)
 
 
 def test_a_person_may_choose_another_view_and_another_planner():

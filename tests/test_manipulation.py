@@ -378,6 +378,8 @@ class TestCommands:
             assert [step["object"] for step in document["steps"]] == taken
             assert all(0.0 <= step["grasp"]["seen_free"] < 0.95 for step in document["steps"])
             assert ("was not seen empty" if not taken else "o1 is removed") in document["stop"]
+            left = {o.id for o in read_run(out).graph.objects} - {"o0"}
+            assert left == ({"o1", "o2"} - {*taken})
 
     def test_it_keeps_looking_while_no_lift_is_safe(self, scene_file, tmp_path, capsys):
         command = ["clear", scene_file, "--views", 6, "--set=active.effort=1", "--json", "--no-report"]

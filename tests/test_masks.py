@@ -8,6 +8,9 @@ from caryatid.errors import InputError
 from caryatid.sensing.masks import labels_from_masks
 from caryatid.sensing.views import View
 
+LEAST = 200 * 640 * 480 // 60**2
+"""Minimum of a mask that is 200 pixels in an image of 60 × 60."""
+
 
 def square(first, last, size=60):
     mask = np.zeros((size, size), dtype=bool)
@@ -27,7 +30,7 @@ def test_the_smallest_mask_is_on_top_in_whatever_order():
 
 def test_background_crumbs_and_doubtful_masks_are_left_out():
     masks = [square(0, 60), square(0, 5), square(5, 30), square(32, 55)]
-    labels = labels_from_masks(masks, [0.9, 0.9, 0.9, 0.3], MaskConfig(min_score=0.5))
+    labels = labels_from_masks(masks, [0.9, 0.9, 0.9, 0.3], MaskConfig(LEAST, min_score=0.5))
     assert np.unique(labels).tolist() == [0, 3]
 
 
@@ -41,8 +44,19 @@ def test_a_mask_nearly_covered_by_smaller_ones_leaves_no_crumbs():
     cover = square(5, 30)
     low, high = cover.copy(), cover.copy()
     low[:18], high[17:] = False, False
-    labels = labels_from_masks([cover, low, high])
+    labels = labels_from_masks([cover, low, high], config=MaskConfig(LEAST))
     assert np.unique(labels).tolist() == [0, 2, 3]
+
+
+def test_what_is_too_small_depends_on_the_size_of_the_image():
+    for size, kept in ((60, True), (600, False)):
+        mask = np.zeros((1, size, size), dtype=bool)
+        mask[:, :10, :10] = True
+        assert labels_from_masks(mask).any() == kept
+
+
+def test_a_segmenter_may_find_nothing():
+    assert not labels_from_masks(np.zeros((0, 60, 60), dtype=bool)).any()
 
 
 def test_of_overlapping_scores_the_largest_is_on_top():

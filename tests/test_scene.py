@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numba
@@ -194,6 +195,30 @@ def test_a_first_view_without_a_pose_gets_one_and_a_view_that_is_refused_changes
     with pytest.raises(PerceptionError):
         scene.update(nothing)
     assert (scene.graph, scene.views, len(scene.cloud)) == kept
+
+
+def test_labels_come_with_all_views_or_with_none():
+    views = simulated_views("tower")
+    scene = model_of(views[:1], segmentation=None)
+    with pytest.raises(InputError, match="has no labels, unlike earlier views"):
+        scene.update(replace(views[1], labels=None))
+    scene.update(views[1])
+    assert scene.views == 2
+
+
+@pytest.mark.parametrize(("factor", "warned"), [(0.5, True), (1.0, False), (2.0, True)])
+def test_intrinsics_of_another_resolution_are_warned_of(factor, warned, caplog):
+    view = replace(simulated_views("tower")[0], T_world_camera=None)
+    with suppress(PerceptionError):
+        Scene(segmentation="labels").update(replace(view, K=np.diag([factor, factor, 1.0]) @ view.K))
+    assert ("is K of another resolution?" in caplog.text) == warned
+
+
+def test_normals_of_a_cloud_may_have_any_length():
+    cloud = simulated_cloud("tower")
+    clouds = [replace(cloud, normals_world=scale * cloud.normals_world) for scale in (1.0, 1.5)]
+    graphs = [model_of([cloud], segmentation="auto").graph for cloud in clouds]
+    assert edges(graphs[0]) == edges(graphs[1])
 
 
 def test_of_large_images_as_many_pixels_are_used_as_points_are_kept(caplog):

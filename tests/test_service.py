@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import urlsplit
 
@@ -74,6 +75,14 @@ def graph_of(views):
     for view in views:
         scene.update(view)
     return graph_to_json(scene.graph)
+
+
+def test_the_name_of_the_folder_changes_no_sentence(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("sess").mkdir()
+    with serving(Path("sess")) as client:
+        answer = client.post("/sessions", json={"name": "a", "planner": "sessile"})
+    assert "unknown planner 'sessile'" in answer.json()["detail"]
 
 
 def test_a_session_over_http_is_the_session(client, views):

@@ -247,7 +247,7 @@ class Explorer:
         decision, stop = None, None
         candidates: Candidates | None = None
         try:
-            candidates = robot.candidates(step.sphere)
+            candidates = reachable_views(robot, step.sphere)
             decision, candidates = _decide(self._state(candidates), robot, self._planner, self.scene.seed)
         except PlanningError as error:
             stop = str(error)
@@ -463,10 +463,26 @@ def next_best_view(
         raise InputError("visited", f"has shape {np.shape(visited)}", "give unit directions (V, 3)")
     if candidates is None:
         assert robot is not None
-        candidates = robot.candidates(sphere)
+        candidates = reachable_views(robot, sphere)
     elif not isinstance(candidates, Candidates):
         candidates = given_candidates(candidates, path_length, poses[-1] if poses else None, sphere)
+        away = np.linalg.norm(candidates.T_world_camera[:, :3, 3] - sphere.centre_world, axis=1)
+        if (away > 2.0 * scene.config.cloud.max_depth).all():
+            reason = f"are all more than {2.0 * scene.config.cloud.max_depth:g} m from the objects"
+            raise InputError("candidates", reason, "give camera poses in metres, in the world frame")
     return _decide(_state(scene, sphere, visited, candidates), robot, make_planner(planner), scene.seed)[0]
+
+
+def reachable_views(robot: Robot, sphere: ViewSphere) -> Candidates:
+    """Return the views of a sphere that a robot reaches.
+
+    Raises:
+        InputError: It returns neither `Candidates` nor poses.
+    """
+    reached: Any = robot.candidates(sphere)
+    if isinstance(reached, Candidates):
+        return reached
+    return given_candidates(reached, None, robot.T_world_camera, sphere)
 
 
 def given_candidates(

@@ -29,7 +29,7 @@ from caryatid.runtime.parallel import one_blas_thread
 from caryatid.segmentation.holes import count_holes
 from caryatid.segmentation.observation import Observation, label_image, observe
 from caryatid.segmentation.support_plane import SupportSurface, refitted
-from caryatid.segmentation.view_checks import check_camera, check_free, check_place
+from caryatid.segmentation.view_checks import check_camera, check_centre, check_free, check_place
 from caryatid.sensing.registration import ViewRegistration
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
@@ -104,6 +104,7 @@ class Scene(Pictured):
         self._shown: tuple[frozenset[str], ...] = ()
         self._ids: dict[int, str] = {}
         self._detector = ChangeDetector()
+        self._labelled: bool | None = None
 
     @property
     def supports(self) -> nx.DiGraph:
@@ -210,10 +211,14 @@ class Scene(Pictured):
             Id of the new object.
 
         Raises:
-            InputError: The scene has no views.
+            InputError: The scene has no views, or the shape no possible size.
         """
         if self.voxels is None:
             raise InputError("scene", "has no views", "add a view first")
+        check_type("shape", shape, Shape, "give a Box, a Cylinder, a Sphere or a Solid")
+        if not 0.0 < shape.extents.min() <= shape.extents.max() <= self.config.cloud.max_depth:
+            reason = f"has extents of {shape.extents.round(3).tolist()} m"
+            raise InputError("shape", reason, "give lengths above 0, in metres")
         label = self._models.put(shape, self.views - 1)
         self._ids = self._ids | {label: object_id(label)}
         self.voxels = self.voxels.forgotten(self.voxels.within(shape, np.zeros((0, 3))))
@@ -300,6 +305,14 @@ class Scene(Pictured):
         check_type("source", source, (View, Cloud), "give a View or a Cloud")
         if isinstance(source, View):
             check_camera(source, self.config.cloud.max_coordinate)
+            if not self.views and not self.waiting:
+                check_centre(source)
+        else:
+            source = replace(source, normals_world=transforms.unit(source.normals_world))
+        labelled = source.labels is not None
+        if self.segmentation is None and self._labelled not in (None, labelled):
+            reason = f"has {'' if labelled else 'no '}labels, unlike earlier views"
+            raise InputError(source.name, reason, "give labels for every view, or for none")
         try:
             if self.waiting:
                 self.surface = self._observed(source).surface
@@ -312,10 +325,11 @@ class Scene(Pictured):
                         raise
                     log.warning(LEFT_OUT, error)
                 else:
+                    self._labelled = labelled
                     yield view
         except NoSurfaceError:
             if isinstance(source, View) and source.T_world_camera is not None:
-                self.waiting = (*self.waiting, source)
+                self.waiting, self._labelled = (*self.waiting, source), labelled
             raise
 
     def _observed(self, source: View | Cloud) -> Observation:

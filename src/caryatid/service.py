@@ -210,7 +210,7 @@ class SessionPool:
     """
 
     def __init__(self, folder: Path, config: Config, open_sessions: int, waiting: int) -> None:
-        self.folder = folder
+        self.folder = folder.resolve()  # a path that no sentence contains by chance
         self.config = config
         self._max_open = open_sessions
         self._max_waiting = waiting

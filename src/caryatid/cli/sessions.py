@@ -108,6 +108,8 @@ class Add(SessionStep):
             images = {"depth": self.depth, "rgb": self.rgb, "labels": self.labels}
             capture = Capture.from_files(images, self.camera, limits)
             added = session.add(capture, self.number)
+        for warning in added.warnings:
+            self.output.say(warning)
         news = "" if added.changed else ", graph unchanged"
         self.show(added.to_json(), f"view {added.number + 1}: {census(added.graph)}{news}")
 

@@ -178,7 +178,8 @@ class MaskConfig:
     """Masks of a learned segmenter."""
 
     min_pixels: WholeNumber = 200
-    """Minimum size of a mask [px], without the pixels that smaller masks take from it."""
+    """Minimum size of a mask in 640 × 480 pixels [px], without those that smaller masks take from it; in
+    another image, the same share."""
     max_share: Share = 0.4
     """Maximum share of the image that a mask covers [1]; a larger one is the table or the background."""
     min_score: float = 0.0

@@ -87,7 +87,7 @@ def levelled(dataset: Dataset, config: Config) -> Dataset:
 
 
 def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
-    """Choose sharp frames of a dataset, each from another viewpoint.
+    """Choose sharp frames of a video, each from another viewpoint; single images count as sharp.
 
     Sharpness is the variance of the Laplacian of the brightness. Without colour it is the share of pixels
     with a reading, because a moving depth camera loses readings at edges.
@@ -98,6 +98,8 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
     Raises:
         InputError: No frame can become a view.
     """
+    if not dataset.is_video:
+        config = replace(config, sharp_share=0.0)
     skipped = Counter(dataset.skipped)
     usable: list[Frame] = []
     sharpness: list[float] = []

@@ -44,7 +44,8 @@ def clear(
         past: Steps of a run to continue; their views are reused, and nothing is removed again.
 
     Yields:
-        A step after each view and its lift; `lift` names the removed object.
+        A step after each view and its lift; `lift` names the removed object, which the graph holds until the
+        next view, or not if there is none.
 
     Raises:
         CaryatidError: A view cannot be used.
@@ -71,7 +72,8 @@ def clear(
         assert explorer.step is not None
         step = replace(explorer.step, lift=lift)
         if reason is not None:
-            step = replace(step, candidates=None, decision=None, stop=reason)
+            # No further view shows what is left.
+            step = replace(step, graph=explorer.scene.graph, candidates=None, decision=None, stop=reason)
         explorer.step = step
         yield step
 

@@ -37,7 +37,7 @@ class Robot(Protocol):
         ...
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
-        """Return the views of the sphere that can be reached."""
+        """Return the views of the sphere that can be reached; camera poses (N, 4, 4) alone are accepted."""
         ...
 
     def move_to(self, T_world_camera: Array) -> float:

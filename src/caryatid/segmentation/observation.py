@@ -229,7 +229,9 @@ def _why_nothing(view: View, config: CloudConfig) -> str:
     if ((readings >= near) & (readings <= far)).any():
         why = "neighbouring pixels are too few, or differ too much in depth"
         return f"shows no surface: {why}; give a larger or less noisy image"
-    ends = dict.fromkeys(f"{end:.3g}" for end in (readings.min(), readings.max()))
+    ends = dict.fromkeys(
+        f"{end:.0f}" if end >= 100.0 else f"{end:.3g}" for end in (readings.min(), readings.max())
+    )
     remedy = "check the unit of depth, or set cloud.min_depth and cloud.max_depth"
     return f"all depth readings are at {'–'.join(ends)} m, none within {near:g}–{far:g} m; {remedy}"
 

@@ -36,6 +36,9 @@ def labels_from_masks(
     """
     config = config or MaskConfig()
     stack, certainty = _stack(masks)
+    if len(stack) == 0:
+        return np.zeros(stack.shape[1:], dtype=np.int32)
+    least = config.min_pixels * stack[0].size / (640 * 480)
     quality = np.full(len(stack), np.inf)
     if scores is not None:
         quality = np.asarray(scores, dtype=np.float64)
@@ -43,7 +46,7 @@ def labels_from_masks(
             reason = f"have shape {quality.shape} or hold NaN for {len(stack)} masks"
             raise InputError("scores", reason, "give one finite score per mask, or no scores")
     pixels = stack.sum(axis=(1, 2))
-    kept = (pixels >= config.min_pixels) & (pixels <= config.max_share * stack[0].size)
+    kept = (pixels >= least) & (pixels <= config.max_share * stack[0].size)
     kept &= quality >= config.min_score
     chosen: list[int] = []
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: (-quality[k], k)):
@@ -58,7 +61,7 @@ def labels_from_masks(
         surest = np.array(chosen)[certainty[chosen].argmax(axis=0)]
         labels = np.where(stack[chosen].any(axis=0), surest + 1, 0).astype(np.int32)
     left = np.bincount(labels.ravel(), minlength=len(stack) + 1)
-    labels[left[labels] < config.min_pixels] = 0
+    labels[left[labels] < least] = 0
     return labels
 
 
@@ -68,8 +71,8 @@ def _stack(masks: ArrayLike | Sequence[ArrayLike]) -> tuple[Masks, NDArray[np.fl
         stack = np.asarray(masks)
     except ValueError:
         raise InputError("masks", "differ in size", "give masks of the size of the depth image") from None
-    if stack.ndim != 3 or 0 in stack.shape:
-        raise InputError("masks", f"have shape {stack.shape}", "give a stack (N, H, W) of at least one mask")
+    if stack.ndim != 3 or 0 in stack.shape[1:]:
+        raise InputError("masks", f"have shape {stack.shape}", "give a stack (N, H, W); N may be 0")
     if stack.dtype == np.bool_ or np.isin(stack, (0, 1)).all() or np.isin(stack, (0, 255)).all():
         return stack.astype(bool), None
     if not np.issubdtype(stack.dtype, np.floating) or not ((stack >= 0.0) & (stack <= 1.0)).all():

@@ -154,7 +154,7 @@ class Cloud(Pictured):
 
     Attributes:
         points_world: (N, 3) [m].
-        normals_world: Unit normals (N, 3) that point towards the sensor.
+        normals_world: Normals (N, 3) that point towards the sensor; a scene scales them to length 1.
         labels: Object number of each point (N,), 0 = nothing, or None.
         rgb: (N, 3) uint8, or None.
         viewpoint_world: Where the sensor was (3,) [m], or None.

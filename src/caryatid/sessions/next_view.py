@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from caryatid.exploration import reachable_views
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
@@ -86,6 +87,6 @@ def reached_candidates(robot: Robot, T_world_camera: Array, sphere: ViewSphere) 
     for T in (T_world_camera, transforms.look_at(T_world_camera[:3, 3], sphere.centre_world)):
         if isinstance(robot.solve(T), Posture):
             robot.move_to(T)
-            return robot.candidates(sphere)
-    found = robot.candidates(sphere)
+            return reachable_views(robot, sphere)
+    found = reachable_views(robot, sphere)
     return found.from_elsewhere(straight_lengths(T_world_camera, found.T_world_camera))

@@ -462,15 +462,12 @@ class Session:
 
     def _check_alike(self, view: View) -> None:
         """Reject a view whose labels or camera do not match those of the first view."""
-        first, segmentation = self._first, self.beginning.segmentation
-        if segmentation == "labels" and view.labels is None:
+        first = self._first
+        if self.beginning.segmentation == "labels" and view.labels is None:
             remedy = "give a label image, or create a session with --segmentation auto"
             raise InputError(view.name, "has no labels", remedy)
         if first is None:
             return
-        if segmentation is None and (first.labels is None) != (view.labels is None):
-            reason = f"has {'no ' if view.labels is None else ''}labels, unlike earlier views"
-            raise InputError(view.name, reason, "give labels for every view, or for none")
         same_size = view.depth.shape == first.depth.shape
         if not same_size or not np.allclose(view.K, first.K, atol=1e-3 * float(first.K[0, 0])):
             reason = f"its camera has {described(view)}, but that of earlier views has {described(first)}"

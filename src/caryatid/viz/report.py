@@ -153,7 +153,9 @@ def make_report(
         views.append(_view(step, news, f1, width))
         if step.view is not None:
             picture = draw_image(step.view, step.labels, step.graph, width // 2, shapes=False)
-            why = "the first view" if before is None or before.decision is None else before.decision.why
+            why = "the first view" if before is None else ""
+            if before is not None and before.decision is not None:
+                why = before.decision.why
             caption = textwrap.shorten(f"{sentence(why)} {sentence(news)}", 220, placeholder=" …")
             heading = " · ".join(filter(None, (views[-1].title, f1)))
             contacts.append(Figure(heading, picture, caption, 4, views[-1].anchor))

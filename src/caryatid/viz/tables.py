@@ -154,7 +154,7 @@ def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
     for s in sorted(graph.supports, key=lambda s: abs(s.belief - 0.5)):
         if not s.certain or s.belief < 0.95:
             lead = f"{s.supporter} → {s.supported}, probability {s.belief:.2f}"
-            found.append((lead, f"{s.why}. {_settled_by(graph, s.supporter, s.supported)}"))
+            found.append((lead, f"{s.why.rstrip('.')}. {_settled_by(graph, s.supporter, s.supported)}"))
     for item in graph.objects:
         poor = f"the points are {1e3 * item.residual:.1f} mm off the shape on average"
         known = item.role == "support_surface" or graph.supporters(item.id)
