@@ -51,7 +51,7 @@ def check_camera(view: View, max_coordinate: float) -> None:
 def check_centre(view: View) -> None:
     """Warn if the principal point is a fifth of the image away from its middle, as for another resolution."""
     size, centre = np.array(view.depth.shape[::-1]), view.K[:2, 2]
-    if (np.abs(centre - size / 2.0) > size / 5.0).any():
+    if (np.abs(centre - (size - 1) / 2.0) > size / 5.0).any():
         text = "%s: K has its principal point at (%.0f, %.0f) in %d×%d pixels; is K of another resolution?"
         log.warning(text, view.name, *centre, *size)
 
