@@ -207,6 +207,7 @@ def test_threads_are_those_that_are_asked_for(monkeypatch):
 
 OVERLAPPING = """
 import sys
+from threading import Event, Thread
 import numpy
 from threadpoolctl import threadpool_info
 from caryatid.runtime.parallel import one_blas_thread
