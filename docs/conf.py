@@ -68,7 +68,7 @@ nitpick_ignore_regex = [
     ("py:.*", rf"({'|'.join(re.escape(m) for m in sorted(modules - documented))})\.\w+"),
 ]
 
-for page in ("benchmark", "benchmark-dismantle"):
+for page in ("benchmark", "benchmark-planners", "benchmark-dismantle"):
     command = f"caryatid benchmark --out results --docs {page}.md"
     write_document(*read_results(DOCS / "results" / f"{page}.json.gz"), DOCS / f"{page}.md", command)
 
