@@ -208,7 +208,9 @@ def read_results(path: Path) -> tuple[list[SuiteResult], dict[str, str]]:
     suites = []
     for suite in known["suites"]:
         summary = pandas.read_csv(
-            io.StringIO(suite["summary"]), keep_default_na=False, na_values={n: [""] for n in ("low", "high")}
+            io.StringIO(suite["summary"]),
+            keep_default_na=False,
+            na_values={n: [""] for n in ("value", "low", "high")},
         )
         suites.append(SuiteResult(**suite | {"summary": summary}))
     return suites, known["about"]
