@@ -114,6 +114,8 @@ def test_the_next_view_can_be_asked_for_alone():
     ):
         with refusal(named):
             next_best_view(scene, candidates=wrong)
+    with pytest.raises(PlanningError):
+        next_best_view(scene, candidates=np.zeros((0, 4, 4)))
     with refusal("path_length"):
         next_best_view(scene, candidates=poses, path_length=[1.0])
     with refusal("scene"):

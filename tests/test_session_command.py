@@ -95,6 +95,11 @@ def test_a_robot_gives_the_poses_it_reaches(folder, files, capsys, views):
     assert run_command("session", "next", folder, "--candidates", path) == 0
     told = json.loads(capsys.readouterr().out)
     assert np.allclose(told["T_world_camera"], poses[told["candidate"]])
+    far = np.array(poses)
+    far[:, :3, 3] *= 1000.0
+    path.write_text(json.dumps({"T_world_camera": far.tolist()}))
+    assert run_command("session", "next", folder, "--candidates", path) == 1
+    assert "give camera poses in metres" in capsys.readouterr().err
     path.write_text("{}")
     assert run_command("session", "next", folder, "--candidates", path) == 1
     assert "'T_world_camera' is missing" in capsys.readouterr().err

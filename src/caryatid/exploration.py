@@ -31,6 +31,8 @@ from caryatid.sensing.views import Camera, Cloud, View
 
 UNTIL = 0.95
 """Default probability at which the effects of removing the goal count as known [1]."""
+FARTHEST = 10.0
+"""Distance of a candidate from the objects, at which it is not in metres [radii of the view sphere]."""
 ATTEMPTS = 20
 """Views that the robot may refuse in one step before the loop stops [1]; a coarse map errs in one of ten."""
 
@@ -466,10 +468,6 @@ def next_best_view(
         candidates = reachable_views(robot, sphere)
     elif not isinstance(candidates, Candidates):
         candidates = given_candidates(candidates, path_length, poses[-1] if poses else None, sphere)
-        away = np.linalg.norm(candidates.T_world_camera[:, :3, 3] - sphere.centre_world, axis=1)
-        if (away > 2.0 * scene.config.cloud.max_depth).all():
-            reason = f"are all more than {2.0 * scene.config.cloud.max_depth:g} m from the objects"
-            raise InputError("candidates", reason, "give camera poses in metres, in the world frame")
     return _decide(_state(scene, sphere, visited, candidates), robot, make_planner(planner), scene.seed)[0]
 
 
@@ -491,7 +489,8 @@ def given_candidates(
     """Check camera poses that a robot can reach from its camera pose (4, 4).
 
     Raises:
-        InputError: They are not poses (N, 4, 4), or path lengths (N,) [m] differ in number or are negative.
+        InputError: They are not poses (N, 4, 4) or not in metres, or path lengths (N,) [m] differ in number
+            or are negative.
     """
     try:
         named = enumerate(np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4))
@@ -500,6 +499,10 @@ def given_candidates(
         remedy = "give camera poses (N, 4, 4) and, optionally, a path length (N,) [m] for each"
         raise InputError("candidates", "are not an array of poses", remedy) from None
     rigid = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in named]).reshape(-1, 4, 4)
+    away, farthest = np.linalg.norm(rigid[:, :3, 3] - sphere.centre_world, axis=1), FARTHEST * sphere.radius
+    if len(away) and away.min() > farthest:
+        reason = f"are all more than {farthest:g} m from the objects"
+        raise InputError("candidates", reason, "give camera poses in metres, in the world frame")
     if lengths is None:
         lengths = straight_lengths(T_world_camera, rigid)
     if lengths.shape != (len(rigid),) or not (lengths >= 0.0).all():
