@@ -139,3 +139,14 @@ def test_among_many_objects_it_reaches_down_to_the_first_one_in_its_way():
         else:
             assert gap < CONFIG.overlap + 0.001
     assert 2 <= reached_table <= 10
+
+
+def test_a_neighbour_that_overlaps_its_wall_does_not_stop_a_lower_side():
+    """Both walls' positions are uncertain; the wall beside it holds nothing up."""
+    hovering = thing(1, box((0.1, 0.0, TABLE_TOP + 0.06), (0.06, 0.08, 0.04)), seen=SIDES_AND_TOP)
+    wall = 0.13 - 1.7 * CONFIG.overlap
+    beside = thing(2, box((wall + 0.02, 0.0, TABLE_TOP + 0.05), (0.04, 0.2, 0.1)))
+    done, _ = completed(hovering, beside)
+    assert lowest(done.shape) == pytest.approx(TABLE_TOP)
+    done, _ = completed(hovering, thing(2, box((wall, 0.0, TABLE_TOP + 0.02), (0.04, 0.2, 0.04))))
+    assert lowest(done.shape) == pytest.approx(TABLE_TOP + 0.04, abs=CONFIG.overlap)

@@ -275,7 +275,7 @@ class CompletionConfig:
     step: Positive = 0.01
     """Step of the extension [m]; a voxel."""
     overlap: NotNegative = 0.004
-    """Maximum penetration of the extended face into another shape [m]; the fits' uncertainty."""
+    """Maximum overlap of the extended face, or its walls, with another shape [m]; the fits' uncertainty."""
     max_free: Share = 0.15
     """Maximum share of the face's rim in voxels observed free [1]; half of one side of four."""
 

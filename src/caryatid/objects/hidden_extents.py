@@ -23,7 +23,7 @@ LEAST = 0.0005
 
 
 Face = tuple[Array, Array]
-"""Points (N, 3) [m] all over a side, and its rim (M, 3), moved inwards to lie inside the shape's walls."""
+"""Points (N, 3) [m] all over a side, and its rim (M, 3)."""
 
 
 def complete(
@@ -95,11 +95,15 @@ def _moved_out(
         return candidate
     (axis, sign), (points, rim) = side, face
     outward = sign * candidate.shape.T_world_object[:3, axis]
+    across = np.delete(candidate.shape.T_world_object[:3, :3], axis, axis=1)
     length, reason = limit, f"is assumed to reach {aim}"
+    # What lies beside the shape may overlap its walls by as much as what lies ahead may overlap the side.
+    points = _inwards(points, across, config.overlap)
     to_object = _way_to_others(points, outward, limit, others, config)
     if to_object < length:
         length, reason = to_object, "ends at the next object"
-    to_free = _free_before(rim, outward, length, voxels, config)
+    # A voxel inside the walls, so that their noise does not count.
+    to_free = _free_before(_inwards(rim, across, config.step), outward, length, voxels, config)
     if to_free < length:
         length, reason = to_free, "ends at free space"
     if length < LEAST:
@@ -167,7 +171,7 @@ def _face(shape: Shape, axis: int, sign: float) -> Face:
         lowest = shape.outline()[shape.lowest(sign * np.eye(3)[axis], SPACING / 2.0)]
         middle = lowest.mean(axis=0)
         rings = [middle + share * (lowest - middle) for share in (0.0, 0.3, 0.6, 0.8, 1.0)]
-        return np.concatenate(rings), rings[-2]
+        return np.concatenate(rings), lowest
     across = [(axis + 1) % 3, (axis + 2) % 3]
     half = shape.extents / 2.0
     u, v = (_ticks(half[k], SPACING) for k in across)
@@ -179,11 +183,16 @@ def _face(shape: Shape, axis: int, sign: float) -> Face:
         points[:, :2] /= np.maximum(outward, 1.0)[:, None]
     else:
         outward = np.abs(points[:, across] / half[across]).max(axis=1)
-    rim = points[outward > 0.99]
-    # A voxel inside the walls, so that their noise does not count.
-    rim[:, across] *= np.maximum(1.0 - 0.01 / half[across], 0.0)
-    T = shape.T_world_object
-    return transforms.transform(T, points), transforms.transform(T, rim)
+    points_world = transforms.transform(shape.T_world_object, points)
+    return points_world, points_world[outward > 0.99]
+
+
+def _inwards(points: Array, across: Array, length: float) -> Array:
+    """Move the outermost of points (N, 3) by a length [m] to their middle along directions (3, 2)."""
+    places = (points - points.mean(axis=0)) @ across
+    half = np.abs(places).max(axis=0)
+    moved: Array = points - (places * np.minimum(length / np.maximum(half, LEAST), 1.0)) @ across.T
+    return moved
 
 
 def _ticks(half: float, spacing: float) -> Array:
