@@ -111,7 +111,8 @@ def _collide(parts: Sequence[Shape], owners: NDArray[np.intp], margin: float) ->
     count, (kinds, R, centres, half) = len(parts), Primitives.of(parts)
     forms = [(k, part.polytopes[0].vertices) for k, part in enumerate(parts) if isinstance(part, Solid)]
     corners = max((len(vertices) for _, vertices in forms), default=0)
-    model, data = _engine(_room(count, 16), _room(corners, 64) if forms else 0, threading.get_ident())
+    room = (_room(len(forms), 4), _room(corners, 64)) if forms else (0, 0)
+    model, data = _engine(_room(count, 16), *room, threading.get_ident())
     size = half.copy()
     size[kinds == CYLINDER, 1] = half[kinds == CYLINDER, 2]
     model.geom_type[:count], model.geom_size[:count] = [_GEOM_TYPES[kind] for kind in kinds.tolist()], size
@@ -149,18 +150,15 @@ def _room(count: int, least: int) -> int:
 
 
 @lru_cache(maxsize=8)
-def _engine(capacity: int, corners: int, thread: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Free bodies with a geom and a mesh each, set before each use; one per thread."""
+def _engine(capacity: int, meshes: int, corners: int, thread: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Free bodies with a geom each, and meshes for some of them, set before each use; one per thread."""
     spec = mujoco.MjSpec()
-    ball = fibonacci_sphere(corners).ravel().tolist() if corners else []
-    for number in range(capacity):
+    for _ in range(capacity):
         body = spec.worldbody.add_body(mass=1.0, inertia=np.ones(3), explicitinertial=True)
         body.add_freejoint()
-        if corners:
-            spec.add_mesh(name=f"mesh{number}", uservert=ball)
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"mesh{number}")
-        else:
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=np.ones(3))
+        body.add_geom(size=np.ones(3))
+    for number in range(meshes):
+        spec.add_mesh(name=f"mesh{number}", uservert=fibonacci_sphere(corners).ravel().tolist())
     model = spec.compile()
     model.geom_pos[:], model.geom_quat[:] = 0.0, (1.0, 0.0, 0.0, 0.0)
     # Faces would be those of the ball: with none, a solid has one contact point with a convex part.
