@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import itertools
 import json
 import re
@@ -11,6 +12,7 @@ import tarfile
 import tomllib
 import zipfile
 from email.parser import Parser
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -100,6 +102,19 @@ def test_all_that_is_needed_is_pinned():
     lines = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
     wanted = {canonicalize_name(Requirement(line).name) for line in itertools.chain(*lines)}
     assert wanted - {"caryatid"} <= pinned
+
+
+def test_all_that_the_package_imports_is_declared():
+    trees = [ast.parse(path.read_text()) for path in (ROOT / "src").rglob("*.py")]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and not node.level}
+    roots = {name.partition(".")[0] for name in names} - sys.stdlib_module_names - {"caryatid"}
+    extras = PROJECT["optional-dependencies"]
+    lines = [PROJECT["dependencies"], *(extras[name] for name in MODULES)]
+    declared = {canonicalize_name(Requirement(line).name) for line in itertools.chain(*lines)}
+    found = packages_distributions()
+    assert {r for r in roots if not {canonicalize_name(n) for n in found.get(r, [r])} & declared} == set()
 
 
 # Extras
