@@ -23,9 +23,14 @@ def find_python(wanted: str) -> Path | None:
     if sys.version.startswith(f"{wanted}."):
         return Path(sys.executable)
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
-    found = sorted(pyenv.glob(f"{wanted}*/bin/python"), reverse=True)
+    found = pyenv.glob(f"{wanted}[.-]*/bin/python")
     command = shutil.which(f"python{wanted}")
-    return Path(command) if command else next(iter(found), None)
+    return Path(command) if command else max(found, key=numbers, default=None)
+
+
+def numbers(python: Path) -> list[int]:
+    """Numbers in the version of a Python of pyenv."""
+    return [int(digits) for digits in re.findall(r"\d+", python.parts[-3])]
 
 
 def try_out(python: Path, distribution: Path, folder: Path) -> dict[str, object]:
