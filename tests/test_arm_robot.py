@@ -124,6 +124,14 @@ class TestCandidates:
         assert [p.joints for p in (arm(T_world_camera=views[0])).waypoints(views[9])] == [None, None]
         assert arm(confirm=lambda T: None).confirm(views[0]) is not None
 
+    def test_joints_are_kept_although_confirm_writes_the_next_into_the_same_array(self):
+        solution = np.array([0.1, 0.2])
+        robot = arm(confirm=lambda T: solution)
+        views = offered(robot).T_world_camera
+        robot.confirm(views[0])
+        solution[:] = 0.5
+        np.testing.assert_array_equal(robot.waypoints(views[0])[0].joints, [0.1, 0.2])
+
     @pytest.mark.parametrize("seed", range(2))
     def test_base_and_table_moved_together_change_nothing(self, seed):
         rng = np.random.default_rng(seed)

@@ -147,7 +147,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         if self._confirm is None:
             return None
         answer = self._confirm(transforms.invert(self.T_world_base) @ T_world_camera)
-        joints = answer if isinstance(answer, np.ndarray) else None
+        joints = answer.copy() if isinstance(answer, np.ndarray) else None
         if joints is None and not answer:
             return Unreachable(UNCONFIRMED)
         self._confirmed = T_world_camera.copy(), joints
