@@ -213,13 +213,15 @@ def test_a_session_that_cannot_be_begun_is_not(client):
 
 @pytest.mark.parametrize("limit", [{"max_sessions": 1}, {"min_free": 1e18}])
 def test_a_service_that_is_full_takes_nothing_new(client, limit, views):
+    client.post("/sessions/a/views", json=body(views[0]))
     config = client.pool.config
     client.pool.config = replace(config, session=replace(config.session, **limit))
     refused = client.post("/sessions", json={"name": "b"})
     assert refused.status_code == 503
     assert f"session.{next(iter(limit))}" in refused.json()["detail"]
-    added = client.post("/sessions/a/views", json=body(views[0]))
-    assert added.status_code == (503 if "min_free" in limit else 201)
+    for page, given in (("views", body(views[1])), ("reports", {"object": "o1"})):
+        added = client.post(f"/sessions/a/{page}", json=given)
+        assert added.status_code == (503 if "min_free" in limit else 201)
 
 
 def test_what_is_not_there_is_said(client):

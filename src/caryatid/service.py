@@ -279,6 +279,17 @@ class SessionPool:
         self._check_room()
         return self.session(name).add(view, number)
 
+    def take(self, name: str, object_id: str, T: Array | None) -> Session:
+        """Report to a session that an object was moved by T (4, 4), or removed; return the session.
+
+        Raises:
+            FullError: The disk is full.
+        """
+        self._check_room()
+        session = self.session(name)
+        session.take(object_id, T)
+        return session
+
     def _check_room(self) -> None:
         free, least = shutil.disk_usage(self.folder).free, self.config.session.min_free
         if free < least:
@@ -384,9 +395,8 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @queued
     def report_change(name: SessionName, given: NewReport) -> Any:
         """Report an object that was removed or moved; once this returns, the report is safe on disk."""
-        session = pool.session(name)
-        graph = session.take(given.object, given.T)
-        return {"views": session.views, "graph": graph_to_json(graph)}
+        session = pool.take(name, given.object, given.T)
+        return {"views": session.views, "graph": graph_to_json(session.graph)}
 
     @app.delete("/sessions/{name}/views/last", response_model=Known)
     @queued
