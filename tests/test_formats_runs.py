@@ -21,6 +21,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Sphere
 from caryatid.graph import SceneObject, SupportGraph
+from caryatid.planning.decision import Decision
 from caryatid.sensing.views import View
 from caryatid.steps import RunWriter, read_run
 
@@ -169,6 +170,14 @@ def test_what_is_no_run_is_never_touched(tmp_path, name):
         writer(folder)
     assert (folder / name).read_text() == '{"format": "something else"}'
     assert [p.name for p in tmp_path.iterdir()] == ["thesis"]
+
+
+def test_a_continued_run_keeps_its_scores(tmp_path):
+    going_on = replace(step(), decision=Decision(T, 0, 0.0, 0.0, 0.0, "more to see"))
+    for last, f1 in ((going_on, 0.25), (step(2), 0.5)):
+        with RunWriter(tmp_path / "RUN", Config(), {}, stepwise=True) as run:
+            run.add(last, {"f1": f1})
+    assert read_run(tmp_path / "RUN").record["scores"] == [{"f1": 0.25}, {"f1": 0.5}]
 
 
 def test_files_and_empty_folders_in_the_way(tmp_path):

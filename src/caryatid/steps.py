@@ -82,6 +82,7 @@ class RunWriter(StagedFolder):
         self._scores: list[Mapping[str, Any]] = []
         if self.past is not None:
             self.steps, self._graph = list(self.past.record["steps"]), self.past.graph
+            self._scores = list(self.past.record.get("scores", ()))
             # Files listed for a view that a kill prevented may be missing.
             self.written |= {name for name in self.past.record["files"] if (self._place / name).exists()}
 
