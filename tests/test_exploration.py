@@ -4,6 +4,7 @@ import itertools
 import json
 import pickle
 from dataclasses import fields, is_dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -118,6 +119,12 @@ def test_the_next_view_can_be_asked_for_alone():
         next_best_view(scene, candidates=np.zeros((0, 4, 4)))
     with refusal("path_length"):
         next_best_view(scene, candidates=poses, path_length=[1.0])
+    for wrong in (visited[0], visited[:0], [[1.0], [1.0, 0.0]], "left", 2.0 * visited, np.nan * visited):
+        with refusal("visited"):
+            next_best_view(scene, None, wrong, candidates=candidates)
+    with refusal("planner's choice", "NoneType"):
+        planner = SimpleNamespace(plan=lambda state, rng: None)
+        next_best_view(scene, candidates=poses, planner=planner)
     with refusal("scene"):
         next_best_view(scene.graph, candidates=poses)
     with pytest.raises(PlanningError, match="neither a robot nor candidates"):

@@ -9,7 +9,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from conftest import SMALL, run_command
+from conftest import SMALL, refusal, run_command
 from synthetic import box, sphere, table_object, thing
 
 from caryatid.config import Config, GripperConfig, LiftConfig, RehearsalConfig, SupportConfig
@@ -149,6 +149,8 @@ class TestOrder:
             plan_order(tower(), CONFIG, goal="o9")
         with pytest.raises(InputError, match="no support surface"):
             plan_order(SupportGraph(tower().objects[1:]), CONFIG)
+        with refusal("threads", "0 is less than 1"):
+            plan_order(tower(), CONFIG, threads=0)
         crowd = [replace(tower().objects[1], id=f"o{number}") for number in range(1000)]
         with pytest.raises(InputError, match=r"1000 objects.* 4\.6 GB per thread; raise"):
             plan_order(SupportGraph((table_object(TOP), *crowd)), CONFIG)

@@ -444,7 +444,8 @@ def next_best_view(
         path to it, `why` the reason.
 
     Raises:
-        InputError: The candidates are not poses, or differ in number from the path lengths.
+        InputError: The candidates are not poses, or differ in number from the path lengths; or `visited` are
+            not unit directions.
         PlanningError: The scene has no view yet, or no view is reachable.
     """
     check_type("scene", scene, Scene, "give a Scene with at least one view")
@@ -461,8 +462,15 @@ def next_best_view(
         if not poses:
             raise PlanningError("no view has a camera pose; give visited, the directions of earlier views")
         visited = sphere.direction_of(np.stack(poses))
-    if np.ndim(visited) != 2 or np.shape(visited)[1] != 3:
-        raise InputError("visited", f"has shape {np.shape(visited)}", "give unit directions (V, 3)")
+    try:
+        visited = np.asarray(visited, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError("visited", "is not an array of numbers", "give unit directions (V, 3)") from None
+    if visited.ndim != 2 or visited.shape[1] != 3 or len(visited) == 0:
+        raise InputError("visited", f"has shape {visited.shape}", "give unit directions (V, 3), at least one")
+    if not np.allclose(np.linalg.norm(visited, axis=1), 1.0, atol=1e-3):
+        remedy = "give directions from the centre of the view sphere, of length 1"
+        raise InputError("visited", "has rows that are not unit vectors", remedy)
     if candidates is None:
         assert robot is not None
         candidates = reachable_views(robot, sphere)
@@ -520,6 +528,7 @@ def _decide(
     why = ""
     for _ in range(ATTEMPTS):
         decision = planner.plan(state, rng)
+        check_type("the planner's choice", decision, Decision, "return a Decision from plan()")
         refused = refusal_of(robot, decision.T_world_camera)
         if refused is None:
             waypoints = waypoints_of(robot, decision.T_world_camera)

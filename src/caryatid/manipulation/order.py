@@ -101,8 +101,10 @@ def plan_order(
 
     Raises:
         InputError: The graph has no support surface, no objects, or more than `rehearsal.max_objects`; or
-            the goal is unknown.
+            the goal is unknown, or there are no threads.
     """
+    if threads < 1:
+        raise InputError("threads", f"{threads} is less than 1", "give the number of parallel rehearsals")
     rehearsal = _Rehearsal(graph, config or Config(), seed, threads, voxels, reachable)
     if goal is not None and goal not in rehearsal.ids:
         raise InputError(goal, "is not an object of the graph", f"known objects: {', '.join(rehearsal.ids)}")
