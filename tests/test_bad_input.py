@@ -226,6 +226,12 @@ def test_a_source_that_does_not_exist(tmp_path, refused, command, name, says):
     refused(command, tmp_path / name, names=name.replace("\n", " "), says=says)
 
 
+@pytest.mark.parametrize("command", ["explore", "extract", "clear"])
+def test_a_run_is_not_a_source(kept_run, refused, command):
+    said = refused(command, kept_run, says="is a run, not a scene or recording")
+    assert f"`caryatid view {kept_run}`" in said
+
+
 def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
     run, broken = tmp_path / "run", tmp_path / "broken"
     assert run_command("extract", recording, "--out", run, "--no-report", "--quiet") == 0

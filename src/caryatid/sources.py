@@ -25,8 +25,9 @@ from caryatid.robots.recording import RecordingCamera, RecordingRobot
 from caryatid.scene import KEPT, LEFT_OUT
 from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import Camera
-from caryatid.simulation.scenes import load_scene
+from caryatid.simulation.scenes import is_builtin, load_scene
 from caryatid.simulation.setup import make_simulation
+from caryatid.steps import is_run
 
 log = logging.getLogger(__name__)
 
@@ -89,6 +90,7 @@ def open_source(
             robot is given for a recording, or an ignore mask or `level` for a simulation.
         PlanningError: The robot cannot reach a view of the table.
     """
+    _check_no_run(source)
     if is_cloud(source):
         raise InputError(source, "a single cloud cannot be explored", "use `caryatid extract`")
     if is_recording(source):
@@ -198,6 +200,7 @@ def extract(
         InputError: The source is unknown, broken, or lacks required labels; or masks are given for a cloud.
         PerceptionError: A cloud shows no support surface.
     """
+    _check_no_run(source)
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
     if not is_cloud(source):
         recording = open_recording(source, config, segmentation, masks, ignore, level)
@@ -215,6 +218,14 @@ def extract(
     cloud = cloud.moved(level_transform(cloud, config, rng, use_labels=use_labels))
     steps = map(explorer.look, [cloud])
     return (replace(step, labels=stored.spread(step.labels)) for step in steps)
+
+
+def _check_no_run(source: str) -> None:
+    """Reject a run folder, unless a built-in scene has its name."""
+    if not is_builtin(source) and is_run(Path(source)):
+        view, score, order = (f"`caryatid {command} {source}`" for command in ("view", "evaluate", "order"))
+        remedy = f"see it with {view}, score it with {score}, or plan lifts with {order}"
+        raise InputError(source, "is a run, not a scene or recording", remedy)
 
 
 def _ignoring(frame: Frame, ignore: Path, max_pixels: int) -> Frame:

@@ -298,8 +298,7 @@ class Clear(options.ExploringCommand):
             source = _opening(self, masks)(config)
         camera = source.camera
         if not isinstance(camera, SimulatedCamera):
-            remedy = "give an MJCF scene; for a run, use `caryatid order`"
-            raise InputError(self.source, "cannot be simulated", remedy)
+            raise InputError(self.source, "cannot be simulated", "give a built-in scene or an MJCF scene")
         known: dict[str, Any] = {"segmentation": self.segmentation, "seed": seed, "masks": masks}
         known |= {"planner": self.chosen_planner, "config": config}
         explorer = Explorer(camera, source.robot, **known)
