@@ -184,6 +184,9 @@ class TestHumanoidRobot:
         shut = HumanoidRobot(floor(box((0.0, 0.0, 1.0), (3.0, 3.0, 1.0))), CONFIG)
         with pytest.raises(PlanningError, match=r"hit an obstacle \(\d"):
             home_view(shut, SPHERE, CONFIG)
+        low = ViewSphere.around((0.0, 0.0, 0.0), ActiveVisionConfig())
+        with pytest.raises(PlanningError, match=r"top is 0\.00 m above the floor.* robot\.camera_height"):
+            home_view(robot, low, CONFIG)
 
 
 class TestRecordingRobot:

@@ -115,4 +115,6 @@ def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:
             return T_world_camera
         rejected[refused.reason] = rejected.get(refused.reason, 0) + 1
     reasons = ", ".join(f"{reason} ({count})" for reason, count in rejected.items())
-    raise PlanningError(f"no view of the view sphere is reachable: {reasons}")
+    height = f"the table top is {sphere.centre_world[2]:.2f} m above the floor, z = 0"
+    remedy = "move the scene, or change robot.camera_height (for an arm, arm.base)"
+    raise PlanningError(f"no view of the view sphere is reachable: {reasons}; {height}: {remedy}")
