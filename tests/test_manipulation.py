@@ -390,5 +390,13 @@ class TestCommands:
         assert (document["views"], document["steps"]) == (6, [])
         assert document["stop"].startswith("no lift is safe")
 
+    def test_a_goal_that_is_never_found_is_an_error(self, scene_file, tmp_path, capsys):
+        command = ["clear", scene_file, "--goal", "o99", "--views", 2, "--quiet", "--no-report"]
+        assert run_command(*command, "--out", tmp_path / "run", *SMALL, *QUICK) == 1
+        said = capsys.readouterr()
+        assert said.out == ""
+        assert said.err == "error: --goal o99: was not found in 2 views; objects found: o1, o2\n"
+        assert len(read_run(tmp_path / "run").views) == 2
+
     def test_a_recording_cannot_be_cleared(self, recording, refused):
         refused("clear", recording, *QUICK, says="cannot be simulated")

@@ -332,6 +332,10 @@ class Clear(options.ExploringCommand):
             last = _record(writer, steps, None, output, f"{source.name} ({conditions})")
         if not self.no_report:
             _draw_report(self.out, output)
+        ids = [o.id for o in last.graph.objects if o.role == "object"]
+        if self.goal is not None and self.goal not in ids and not lifts:
+            reason = f"was not found in {count_of(last.index + 1, 'view')}"
+            raise InputError(f"--goal {self.goal}", reason, f"objects found: {', '.join(ids) or 'none'}")
         harmed = sorted({body for lift in lifts for body in lift["disturbed"]})
         reached = any(lift["object"] == self.goal for lift in lifts) if self.goal else not hands.left
         taken = [{name: value for name, value in lift.items() if name != "state"} for lift in lifts]
