@@ -390,13 +390,28 @@ class TestCommands:
         assert (document["views"], document["steps"]) == (6, [])
         assert document["stop"].startswith("no lift is safe")
 
-    def test_a_goal_that_is_never_found_is_an_error(self, scene_file, tmp_path, capsys):
-        command = ["clear", scene_file, "--goal", "o99", "--views", 2, "--quiet", "--no-report"]
-        assert run_command(*command, "--out", tmp_path / "run", *SMALL, *QUICK) == 1
-        said = capsys.readouterr()
-        assert said.out == ""
-        assert said.err == "error: --goal o99: was not found in 2 views; objects found: o1, o2\n"
-        assert len(read_run(tmp_path / "run").views) == 2
+    @pytest.mark.parametrize(
+        ("segmentation", "why", "views"),
+        [("labels", "is not an object of the scene; known objects: o1, o2", None),
+         ("auto", "was not found in 2 views; objects found: o1", 2)],
+    )  # fmt: skip
+    def test_an_unknown_goal_is_an_error(self, segmentation, why, views, scene_file, tmp_path, capsys):
+        command = ["clear", scene_file, "--goal", "o99", "--views", 2, "--segmentation", segmentation]
+        command += ["--quiet", "--no-report", "--out", tmp_path / "run"]
+        assert run_command(*command, *SMALL, *QUICK) == 1
+        assert capsys.readouterr() == ("", f"error: --goal o99: {why}\n")
+        assert (tmp_path / "run").exists() == (views is not None)
+        assert views is None or len(read_run(tmp_path / "run").views) == views
+
+    @pytest.mark.parametrize(("segmentation", "first"), [("labels", "o4"), ("auto", None)])
+    def test_a_goal_that_no_view_shows_is_uncovered_where_labels_can_name_it(self, segmentation, first):
+        table = simulate("bridge")
+        few = replace(CONFIG, active=replace(CONFIG.active, max_views=2))
+        explorer = Explorer(table.camera, table.robot, config=few, segmentation=segmentation)
+        steps = clear(explorer, lambda lift: True, goal="o9")
+        lift = next((step.lift for step in steps if step.lift is not None), None)
+        assert (lift and lift.object_id) == first
+        assert first or explorer.step.stop.endswith("o9 was not found")
 
     def test_a_recording_cannot_be_cleared(self, recording, refused):
         refused("clear", recording, *QUICK, says="cannot be simulated")

@@ -71,6 +71,7 @@ class Scene(Pictured):
         views: Number of views in the model.
         waiting: Views kept until a later one shows the support surface.
         changed: Whether the newest view changed the graph.
+        identified: Whether the labels given with the newest view are those of the objects in all views.
         timings: Time of each stage of the newest update [s].
     """
 
@@ -97,6 +98,7 @@ class Scene(Pictured):
         self.views = 0
         self.waiting: tuple[View, ...] = ()
         self.changed = False
+        self.identified = False
         self.timings: dict[str, float] = {}
         self._models = ObjectModels(self.config, seed)
         self._registration: ViewRegistration | None = None
@@ -340,7 +342,7 @@ class Scene(Pictured):
     def _take_in(self, source: View | Cloud) -> None:
         watch = Stopwatch()
         given = source.labels is not None and self.segmentation != "auto"
-        named = given and self._named(source)
+        self.identified = named = given and self._named(source)
         observation = self._observed(source)
         if observation.view is not None and isinstance(source, View):
             self._say_thinned(source, observation.view)

@@ -283,6 +283,7 @@ class Clear(options.ExploringCommand):
 
         from caryatid.cli.output import table
         from caryatid.exploration import Explorer
+        from caryatid.graph import object_id
         from caryatid.io.json_files import plain
         from caryatid.manipulation.clearing import clear
         from caryatid.manipulation.dismantling import SimulatedHands
@@ -299,6 +300,11 @@ class Clear(options.ExploringCommand):
         camera = source.camera
         if not isinstance(camera, SimulatedCamera):
             raise InputError(self.source, "cannot be simulated", "give a built-in scene or an MJCF scene")
+        labels = range(1, len(camera.scene.object_bodies) + 1)
+        ids = [object_id(label) for label in labels if self.segmentation != "auto" and masks is None]
+        if ids and self.goal is not None and self.goal not in ids:
+            reason = "is not an object of the scene"
+            raise InputError(f"--goal {self.goal}", reason, f"known objects: {', '.join(ids)}")
         known: dict[str, Any] = {"segmentation": self.segmentation, "seed": seed, "masks": masks}
         known |= {"planner": self.chosen_planner, "config": config}
         explorer = Explorer(camera, source.robot, **known)
@@ -332,10 +338,10 @@ class Clear(options.ExploringCommand):
             last = _record(writer, steps, None, output, f"{source.name} ({conditions})")
         if not self.no_report:
             _draw_report(self.out, output)
-        ids = [o.id for o in last.graph.objects if o.role == "object"]
-        if self.goal is not None and self.goal not in ids and not lifts:
+        found = [o.id for o in last.graph.objects if o.role == "object"]
+        if self.goal is not None and self.goal not in found and not lifts:
             reason = f"was not found in {count_of(last.index + 1, 'view')}"
-            raise InputError(f"--goal {self.goal}", reason, f"objects found: {', '.join(ids) or 'none'}")
+            raise InputError(f"--goal {self.goal}", reason, f"objects found: {', '.join(found) or 'none'}")
         harmed = sorted({body for lift in lifts for body in lift["disturbed"]})
         reached = any(lift["object"] == self.goal for lift in lifts) if self.goal else not hands.left
         taken = [{name: value for name, value in lift.items() if name != "state"} for lift in lifts]

@@ -30,9 +30,10 @@ def clear(
     A lift is safe if no other object moves with a probability above `config.rehearsal.risk`, as in
     `plan_order`; with a gripper, it also needs a grasp. It is carried out when no view of what it depends on
     is worth its path. With a goal, this is a view of what removing the goal depends on, because it may show
-    that nothing else has to go. While no lift is safe, the robot keeps looking. Both end after
-    `config.active.max_views` views since the previous lift. After each lift the robot looks again, and so
-    detects objects that slid or fell.
+    that nothing else has to go. A goal that no view shows is uncovered if given labels identify objects: the
+    robot then removes what it would remove without a goal. While no lift is safe, it keeps looking. Both end
+    after `config.active.max_views` views since the previous lift. After each lift the robot looks again, and
+    so detects objects that slid or fell.
 
     Args:
         explorer: Explorer with a camera and a robot, without a goal.
@@ -87,14 +88,16 @@ def _lift(
     if not ids and goal is None:
         return None, "no objects are left"
     lift, missing, found = None, f"{goal} was not found", goal is None or goal in ids
-    if found:
-        known: Any = {"goal": goal, "hands": hands, "seed": scene.seed, "threads": threads}
+    if found or (ids and scene.identified):
+        wanted = goal if found else None  # What hides the goal has to go.
+        known: Any = {"goal": wanted, "hands": hands, "seed": scene.seed, "threads": threads}
         order = plan_order(
             scene.graph, scene.config, steps=1, voxels=scene.voxels, reachable=reachable, **known
         )
-        lift, missing = next(iter(order.steps), None), order.refusal
+        lift = next(iter(order.steps), None)
+        missing = order.refusal if found else missing
     safe = lift if lift is not None and lift.safe else None
-    explorer.goal = None if safe is None else goal or safe.object_id
+    explorer.goal = None if safe is None or not found else goal or safe.object_id
     step = explorer.plan()
     # While no lift is safe, a view that shows little is worth its path too.
     enough = explorer.reason_to_stop() if safe or not found else step.stop
