@@ -21,6 +21,8 @@ from caryatid.config import VoxelConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import Primitives, Shape
+from caryatid.geometry.signed_distance import gradient, local
+from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, for_each, inner, kernel
 from caryatid.sensing.views import View
@@ -143,8 +145,8 @@ class VoxelMap:
 
     def occluders(self, shapes: Sequence[Shape] = ()) -> Occluders:
         """What blocks lines of sight: voxels seen occupied, and all that is inside shapes in the world."""
-        size, bounds = self.config.size, Primitives.of(shapes).bounds()
-        low, high = ((corner - self.origin_world) / size for corner in bounds)
+        arrays, size = Primitives.of(shapes), self.config.size
+        low, high = ((corner - self.origin_world) / size for corner in arrays.bounds())
         low = np.clip(np.floor(low).astype(np.int64), 0, self.hits.shape)
         high = np.clip(np.ceil(high).astype(np.int64), 0, self.hits.shape)
         some, index = (low < high).all(axis=1), self.occupied.T
@@ -153,10 +155,14 @@ class VoxelMap:
         grid = np.zeros(np.maximum(highest - lowest, 0), dtype=np.uint8)
         grid[tuple(self.occupied - lowest[:, None])] = 1
         origin_world = self.origin_world + size * lowest
-        for shape, first, end in zip(shapes, low, high, strict=True):
-            index = _indices(first, end) - lowest
-            inside = shape.signed_distance(origin_world + size * (index + 0.5)) < 0.0
-            grid[tuple(index[inside].T)] = 1
+        low, high = low - lowest, high - lowest
+        for number, shape in enumerate(shapes):
+            if isinstance(shape, Solid):  # Kernels see only the box around it.
+                index = _indices(low[number], high[number])
+                inside = shape.signed_distance(origin_world + size * (index + 0.5)) < 0.0
+                grid[tuple(index[inside].T)] = 1
+                high[number] = low[number]
+        _fill(*arrays, low, high, grid, origin_world, size)
         return Occluders(origin_world, grid, self)
 
     def cut(self, low_world: Array, high_world: Array) -> VoxelMap:
@@ -348,6 +354,22 @@ def _count_marks(share, data):  # type: ignore[no-untyped-def]
         hit, passed = new_hits[n], new_passes[n]
         new_hits[n] = hits[n] + np.uint8((hit > 0) & (hits[n] < 255))
         new_passes[n] = passes[n] + np.uint8((passed > hit) & (passes[n] < 255))
+
+
+@kernel
+def _fill(kinds, R, centres, half, low, high, grid, origin, size):  # type: ignore[no-untyped-def]
+    """Mark the voxels of a grid whose centres are inside one of N shapes, if low ≤ index < high (N, 3)."""
+    centre = np.empty((1, 3))
+    for s in range(len(kinds)):
+        for i in range(low[s, 0], high[s, 0]):
+            centre[0, 0] = origin[0] + (i + 0.5) * size
+            for j in range(low[s, 1], high[s, 1]):
+                centre[0, 1] = origin[1] + (j + 0.5) * size
+                for k in range(low[s, 2], high[s, 2]):
+                    centre[0, 2] = origin[2] + (k + 0.5) * size
+                    x, y, z = local(R[s], centres[s], centre, 0)
+                    if gradient(kinds[s], x, y, z, half[s, 0], half[s, 1], half[s, 2])[0] < 0.0:
+                        grid[i, j, k] = 1
 
 
 @kernel
