@@ -31,12 +31,12 @@ def _few_voxels(extent: tuple[float, float, float], info: ValidationInfo) -> tup
     return extent
 
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0, le=1e18)]
+NotNegative = Annotated[float, Field(ge=0, le=1e18)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Likelihood = Annotated[float, Field(gt=0, lt=1)]
 """A probability that is neither impossible nor certain: its odds are finite."""
-Factor = Annotated[float, Field(ge=1)]
+Factor = Annotated[float, Field(ge=1, le=1e18)]
 Angle = Annotated[float, Field(ge=0, le=180)]
 Acute = Annotated[float, Field(ge=0, lt=90)]
 """An angle whose cosine is divided by."""
@@ -272,7 +272,7 @@ class CompletionConfig:
     """Whether unseen faces are extended."""
     max_tilt: Angle = 30.0
     """Maximum angle between an unseen face's normal and straight down [deg]; only such faces bear weight."""
-    step: Positive = 0.01
+    step: Annotated[float, Field(ge=1e-3, le=1.0)] = 0.01
     """Step of the extension [m]; a voxel."""
     overlap: NotNegative = 0.004
     """Maximum overlap of the extended face, or its walls, with another shape [m]; the fits' uncertainty."""
