@@ -93,7 +93,8 @@ def _ranges(stage: Any) -> dict[str, str]:
     found = {}
     for name, schema in TypeAdapter(stage).json_schema()["properties"].items():
         values = next(iter(schema.get("prefixItems", ())), schema.get("items", schema))
-        limits = [f"{word} {values[key]:g}" for key, word in words.items() if key in values]
+        # Larger bounds only keep numbers from overflowing.
+        limits = [f"{word} {values[key]:g}" for key, word in words.items() if values.get(key, 1e9) < 1e9]
         if "enum" in values:
             limits.append(f"one of {', '.join(map(str, values['enum']))}")
         found[name] = f" Range: {', '.join(limits)}." if limits else ""
