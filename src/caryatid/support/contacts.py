@@ -157,8 +157,9 @@ def _engine(capacity: int, meshes: int, corners: int, thread: int) -> tuple[mujo
         body = spec.worldbody.add_body(mass=1.0, inertia=np.ones(3), explicitinertial=True)
         body.add_freejoint()
         body.add_geom(size=np.ones(3))
+    ball = fibonacci_sphere(corners).ravel().tolist() if meshes else []
     for number in range(meshes):
-        spec.add_mesh(name=f"mesh{number}", uservert=fibonacci_sphere(corners).ravel().tolist())
+        spec.add_mesh(name=f"mesh{number}", uservert=ball)
     model = spec.compile()
     model.geom_pos[:], model.geom_quat[:] = 0.0, (1.0, 0.0, 0.0, 0.0)
     # Faces would be those of the ball: with none, a solid has one contact point with a convex part.
