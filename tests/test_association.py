@@ -44,21 +44,23 @@ def test_what_lies_elsewhere_is_a_new_object_with_a_label_never_given():
     assert names_of() == {}
 
 
+def unlike(**rows):
+    """Points of these rows have another colour than the object of a name, `o3` or `o7`."""
+    return lambda name, index: np.isin(index, rows.get(f"o{name}", []))
+
+
 def test_a_part_of_another_colour_is_a_new_object_though_it_lies_on_a_shape():
     part = seen(CRATE, seed=1)
-    other_colour = np.zeros((len(part) + 5, len(KNOWN)), dtype=bool)
-    assert names_of(part, other_colour=other_colour) == {1: 3}
-    other_colour[: 4 * len(part) // 5, 0] = True
-    assert names_of(part, other_colour=other_colour) == {1: 8}
+    assert names_of(part, other_colour=unlike()) == {1: 3}
+    assert names_of(part, other_colour=unlike(o3=np.arange(4 * len(part) // 5))) == {1: 8}
 
 
 def test_a_few_points_of_another_colour_go_to_the_neighbour_that_has_it():
     crate, few = seen(CRATE, seed=1), seen(BALL, seed=1)[:20]
     part = np.concatenate([crate, few])
-    other_colour = np.zeros((len(part) + 5, len(KNOWN)), dtype=bool)
-    assert names_of(part, other_colour=other_colour) == {1: 3}
-    other_colour[len(crate) : len(part), 0] = True
-    other_colour[: len(crate), 1] = True
+    assert names_of(part, other_colour=unlike()) == {1: 3}
+    rows = np.arange(len(part))
+    other_colour = unlike(o3=rows[len(crate) :], o7=rows[: len(crate)])
     assert names_of(part, other_colour=other_colour) == {1: [3, 7]}
 
 

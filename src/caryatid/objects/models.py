@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from itertools import combinations
 from typing import Any
 
@@ -37,6 +37,9 @@ from caryatid.segmentation.observation import Observation
 from caryatid.sensing.clouds import thin
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 from caryatid.sensing.voxel_map import VoxelMap
+
+OtherColour = Callable[[int, NDArray[np.intp]], NDArray[np.bool_]]
+"""Which points of an index (M,) have another colour than the object of a name: (M,)."""
 
 
 class ObjectPoints:
@@ -299,20 +302,24 @@ class ObjectModels:
             self._distinct |= {names} if len(names) == 2 else set()
         return observation.with_labels(np.where(labels == SUPPORT_LABEL, labels, named))
 
-    def _other_colour(self, observation: Observation) -> NDArray[np.bool_] | None:
-        """Which points (N,) of a view have another colour than plain objects (K,), ascending: (N, K)."""
-        config, rgb, names = self._config.explanation, observation.cloud.rgb, self.points.objects
+    def _other_colour(self, observation: Observation) -> OtherColour | None:
+        """Which points of a view have another colour than a plain object; None if the view has no colours."""
+        config, rgb = self._config.explanation, observation.cloud.rgb
         if rgb is None:
             return None
-        other_colour = np.zeros((len(rgb), len(names)), dtype=bool)
-        rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
-        for column, name in enumerate(names):
+
+        @cache
+        def plain(name: int) -> Array | None:
             colours = self.points.of(name, config.spacing).rgb
-            plain = None if colours is None else plain_colour(colours, config)[1]
-            if plain is not None:
-                costs = colour_costs(rgb[rows], plain[None], config)[:, 0]
-                other_colour[rows, column] = costs >= config.outlier
-        return other_colour
+            return None if colours is None else plain_colour(colours, config)[1]
+
+        def differ(name: int, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+            colour = plain(name)
+            if colour is None:
+                return np.zeros(len(rows), dtype=np.bool_)
+            return colour_costs(rgb[rows], colour[None], config)[:, 0] >= config.outlier
+
+        return differ
 
     def mislabelled(self, observation: Observation) -> tuple[int, int]:
         """Number of labels of a view that lie on objects with other labels, and number of its labels."""
@@ -418,13 +425,18 @@ class ObjectModels:
         """
         noise, config = self._noise(), self._config.explanation
         changed = sorted(labels & self.fits.keys())
-        seen = {k: self.points.of(k, config.spacing).points_world for k in self.fits}
+        seen = {k: self.points.of(k, config.spacing).points_world for k in sorted(self.fits)}
+        every = np.concatenate([table, *seen.values()])
+        owners = np.repeat([SUPPORT_LABEL, *seen], [len(table), *map(len, seen.values())])
+        tree = cKDTree(every)
 
         def formed(number: int) -> SceneObject | None:
             label = changed[number]
             evidence, explanation = self._explained(label, noise, voxels)
-            around = np.concatenate([table, *(seen[k] for k in seen if k != label)])
-            inside = self.fits[label].shape.signed_distance(around) < -3.0 * noise
+            shape = self.fits[label].shape
+            middle, size = shape.T_world_object[:3, 3], float(np.linalg.norm(shape.extents))
+            near = np.array(tree.query_ball_point(middle, size / 2.0), dtype=np.intp)
+            inside = shape.signed_distance(every[near[owners[near] != label]]) < -3.0 * noise
             taken = config.outlier * evidence.weight * np.count_nonzero(inside)
             irregular = best_explanation([], evidence, config)
             if explanation.shape is not None and explanation.cost + taken <= irregular.cost:
@@ -521,7 +533,7 @@ def associate(
     labels_used: int = 0,
     *,
     masks: bool = False,
-    other_colour: NDArray[np.bool_] | None = None,
+    other_colour: OtherColour | None = None,
     new: Set[int] = frozenset(),
 ) -> NDArray[np.int32]:
     """Give the points of each new segment the label of the object they belong to, or one never used before.
@@ -540,25 +552,19 @@ def associate(
         config: Share that must overlap, and the distance that counts as overlap.
         labels_used: Highest label ever given; new objects are numbered from the next one.
         masks: Whether the segments are masks.
-        other_colour: Which points differ in colour from which known object (N, K); None if none does.
+        other_colour: Which points differ in colour from a known object; None if none does.
         new: Segments that belong to no known object.
 
     Returns:
         Label of the object (N,) of each point; 0 where there was no segment.
     """
-    names = np.array(sorted(known_points), dtype=np.int32)
     reach = config.overlap_reach
     spacing = reach / 4.0
-    owners = np.repeat(np.arange(len(names), dtype=np.int32), [len(known_points[k]) for k in names])
-    points = np.concatenate([np.zeros((0, 3)), *(known_points[k] for k in names)])
-    thinned = most_central(points, owners, np.full(len(names), spacing))
-    points, owners = points[thinned], owners[thinned]
-    shapes = [known_shapes.get(k) for k in names.tolist()]
+    known = _KnownObjects(known_points, known_shapes, spacing, reach, other_colour)
+    names = known.names
     counts = np.bincount(labels, minlength=1)
     kept = most_central(points_world, labels, np.where(np.arange(len(counts)) > 0, spacing, 0.0))
-    if other_colour is None:
-        other_colour = np.zeros((len(labels), len(names)), dtype=bool)
-    owner = _nearest_objects(points_world[kept], points, owners, shapes, other_colour[kept], reach)
+    owner = known.nearest(points_world, kept)
     segments = np.flatnonzero(counts[1:]) + 1
     shared = np.zeros((len(segments), len(names)), dtype=np.intp)
     near = owner >= 0
@@ -574,20 +580,17 @@ def associate(
             highest += 1
             result[index] = highest
         else:
-            own, other = points_world[index], other_colour[index]
-            theirs = np.isin(owners, among)
             nearest = np.full(len(index), among[0], dtype=np.int32)
             if len(among) > 1:
-                some = [shape if k in among else None for k, shape in enumerate(shapes)]
-                nearest = _nearest_objects(own, points[theirs], owners[theirs], some, other, reach)
-            unmatched = other[:, among].all(axis=1)
+                nearest = known.nearest(points_world, index, among)
+            unmatched = known.unlike(among, index)
             if unmatched.any():
-                nearest[unmatched] = _nearest_objects(
-                    own[unmatched], points, owners, shapes, other[unmatched], reach
-                )
+                nearest[unmatched] = known.nearest(points_world, index[unmatched])
             far = nearest < 0
             if far.any():
-                nearest[far] = owners[theirs][cKDTree(points[theirs]).query(own[far])[1]]
+                theirs = np.isin(known.owners, among)
+                tree = cKDTree(known.points[theirs])
+                nearest[far] = known.owners[theirs][tree.query(points_world[index[far]])[1]]
             result[index] = names[nearest]
     return result
 
@@ -608,50 +611,90 @@ def _one_to_one(shared: NDArray[np.intp], shares: Array, least: float) -> list[N
     return [np.array([matched[m]] if m in matched else [], dtype=np.intp) for m in range(len(worth))]
 
 
-def _nearest_objects(
-    points: Array,
-    known: Array,
-    owners: NDArray[np.int32],
-    shapes: list[Shape | None],
-    other_colour: NDArray[np.bool_],
-    reach: float,
-) -> NDArray[np.int32]:
-    """Which object (N,) is nearest to each point (N, 3), by its points or its shape's surface; −1 = none.
+class _KnownObjects:
+    """Known objects 0 … K − 1, in the order of their names, to which new points may belong.
 
     Args:
-        points: (N, 3) [m].
-        known: Points (M, 3) [m] of all objects.
-        owners: Object (M,) of each: 0 … K−1, ascending.
-        shapes: Shape of each object, or None.
-        other_colour: Points that have another colour than the object (N, K).
+        points: Points (M, 3) [m] of each object, by its name.
+        shapes: Shape of each object that has one.
+        spacing: Edge length [m] of the voxels in which one point of each object is enough.
         reach: Objects from here on count as none [m].
+        other_colour: Which points differ in colour from an object; None if none does.
+
+    Attributes:
+        names: (K,).
+        points: Thinned points (M, 3) [m] of all.
+        owners: Object (M,) of each; ascending.
     """
-    nearest, gap = np.full(len(points), -1, dtype=np.int32), np.full(len(points), reach)
-    if not len(points):
+
+    def __init__(
+        self,
+        points: Mapping[int, Array],
+        shapes: Mapping[int, Shape],
+        spacing: float,
+        reach: float,
+        other_colour: OtherColour | None,
+    ) -> None:
+        self.names = np.array(sorted(points), dtype=np.int32)
+        count = len(self.names)
+        owners = np.repeat(np.arange(count, dtype=np.int32), [len(points[k]) for k in self.names])
+        every = np.concatenate([np.zeros((0, 3)), *(points[k] for k in self.names)])
+        thinned = most_central(every, owners, np.full(count, spacing))
+        self.points, self.owners = every[thinned], owners[thinned]
+        self._shapes = [shapes.get(k) for k in self.names.tolist()]
+        self._reach, self._other_colour = reach, other_colour
+        self._ends = np.searchsorted(self.owners, np.arange(count + 1))
+        self._trees: dict[int, cKDTree] = {}
+        # Bounds of each object's points, and of its shape.
+        self._low, self._high = np.full((count, 2, 3), np.inf), np.full((count, 2, 3), -np.inf)
+        seen = np.flatnonzero(np.diff(self._ends))
+        if len(seen):
+            self._low[seen, 0] = np.minimum.reduceat(self.points, self._ends[seen]) - reach
+            self._high[seen, 0] = np.maximum.reduceat(self.points, self._ends[seen]) + reach
+        shaped = [number for number, shape in enumerate(self._shapes) if shape is not None]
+        low, high = Primitives.of([s for s in self._shapes if s is not None]).bounds()
+        self._low[shaped, 1], self._high[shaped, 1] = low - reach, high + reach
+
+    def nearest(
+        self, points: Array, index: NDArray[np.intp], among: NDArray[np.intp] | None = None
+    ) -> NDArray[np.int32]:
+        """Which object (M,), of all or of some, is nearest to points of an index (M,); −1 = none.
+
+        What counts is the distance to its points or to its shape's surface.
+        """
+        own = points[index]
+        nearest, gap = np.full(len(own), -1, dtype=np.int32), np.full(len(own), self._reach)
+        if not len(own):
+            return nearest
+        near = ((self._low <= own.max(axis=0)) & (self._high >= own.min(axis=0))).all(axis=2)
+        if among is not None:
+            near[np.setdiff1d(np.arange(len(near)), among)] = False
+        for number, by in np.argwhere(near).tolist():
+            within = ((own > self._low[number, by]) & (own < self._high[number, by])).all(axis=1)
+            rows = np.flatnonzero(within)
+            rows = rows[~self.unlike([number], index[rows])]
+            if not len(rows):
+                continue
+            distance = self._distance(number, by == 1, own[rows])
+            nearer = distance < gap[rows]
+            nearest[rows[nearer]], gap[rows[nearer]] = number, distance[nearer]
         return nearest
-    ends = np.searchsorted(owners, np.arange(len(shapes) + 1))
-    seen = np.flatnonzero(np.diff(ends))
-    shaped = [number for number, shape in enumerate(shapes) if shape is not None]
-    # Bounds of each object's points, and of its shape, two rows an object.
-    low, high = np.full((len(shapes), 2, 3), np.inf), np.full((len(shapes), 2, 3), -np.inf)
-    if len(seen):
-        low[seen, 0] = np.minimum.reduceat(known, ends[seen]) - reach
-        high[seen, 0] = np.maximum.reduceat(known, ends[seen]) + reach
-    corners = Primitives.of([s for s in shapes if s is not None]).bounds()
-    low[shaped, 1], high[shaped, 1] = corners[0] - reach, corners[1] + reach
-    may_be_near = ((low <= points.max(axis=0)) & (high >= points.min(axis=0))).all(axis=2)
-    for number, by in np.argwhere(may_be_near).tolist():
-        within = ((points > low[number, by]) & (points < high[number, by])).all(axis=1)
-        rows = np.flatnonzero(within & ~other_colour[:, number])
-        if not len(rows):
-            continue
-        shape = shapes[number]
-        if by == 0:
-            tree = cKDTree(known[ends[number] : ends[number + 1]], compact_nodes=False, balanced_tree=False)
-            distance = tree.query(points[rows], distance_upper_bound=reach)[0]
-        else:
-            assert shape is not None
-            distance = np.abs(shape.signed_distance(points[rows]))
-        nearer = distance < gap[rows]
-        nearest[rows[nearer]], gap[rows[nearer]] = number, distance[nearer]
-    return nearest
+
+    def unlike(self, numbers: Iterable[int], index: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which points of an index (M,) have another colour than each of some objects."""
+        unlike = np.full(len(index), self._other_colour is not None)
+        for number in numbers:
+            if self._other_colour is not None and unlike.any():
+                unlike[unlike] = self._other_colour(int(self.names[number]), index[unlike])
+        return unlike
+
+    def _distance(self, number: int, by_shape: bool, points: Array) -> Array:
+        """Distance (M,) [m] of points (M, 3) to an object's shape or points; infinite beyond reach."""
+        shape = self._shapes[number]
+        if by_shape and shape is not None:
+            return np.abs(shape.signed_distance(points))
+        if number not in self._trees:
+            own = self.points[self._ends[number] : self._ends[number + 1]]
+            self._trees[number] = cKDTree(own, compact_nodes=False, balanced_tree=False)
+        distance: Array = self._trees[number].query(points, distance_upper_bound=self._reach)[0]
+        return distance

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -43,15 +41,16 @@ def merge_insides(samples: Samples, part: Labels) -> tuple[Labels, Mask]:
     reach = max(2, round(RIM_WIDTH * samples.K[0, 0] / float(np.median(samples.points_camera[:, 2]))))
     look, top = hollowness(samples.points_camera, samples.normals_camera, merged), _tops(samples, merged)
     look[0] = 0.0
-    for first, second in combinations(range(1, len(look)), 2):
-        a, b = int(merged[np.argmax(part == first)]), int(merged[np.argmax(part == second)])
+    into = np.arange(len(look))
+    for first, second in _beside(samples.image(part), reach):
+        a, b = into[first], into[second]
         if a == b or not abs(top[a] - top[b]) < RIM:
             continue
         both = np.flatnonzero((merged == a) | (merged == b))
         points, normals = samples.points_camera[both], samples.normals_camera[both]
         joint = float(hollowness(points, normals, np.zeros(len(both), dtype=np.intp))[0])
         if joint > max(HOLLOW, look[a], look[b]) and _meet(samples.image(merged), a, b, reach):
-            merged[both], look[a] = a, joint
+            merged[both], into[into == b], look[a] = a, a, joint
     for number in np.flatnonzero(look > HOLLOW).tolist():
         own = merged == number
         if not own.any() or np.ptp(np.quantile(samples.height[own], (0.05, 0.95))) < RIM:
@@ -76,6 +75,15 @@ def _tops(samples: Samples, part: Labels) -> Array:
     for number in np.unique(part[part > 0]).tolist():
         tops[number] = np.quantile(samples.height[part == number], 0.95)
     return tops
+
+
+def _beside(image: Labels, reach: int) -> NDArray[np.intp]:
+    """Pairs (K, 2) of parts of an image (H, W) whose rows and columns come within a reach; ascending."""
+    boxes = {number: box for number, box in enumerate(ndimage.find_objects(image), start=1) if box}
+    start = np.array([[own.start - reach for own in box] for box in boxes.values()]).reshape(-1, 2)
+    stop = np.array([[own.stop for own in box] for box in boxes.values()]).reshape(-1, 2)
+    near = (start[:, None] < stop).all(axis=-1)
+    return np.array(list(boxes), dtype=np.intp)[np.argwhere(np.triu(near & near.T, 1))]
 
 
 def _meet(image: Labels, first: int, second: int, reach: int) -> bool:

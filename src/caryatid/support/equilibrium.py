@@ -10,6 +10,8 @@ from functools import lru_cache
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from caryatid.config import SupportConfig
 from caryatid.geometry import transforms
@@ -75,9 +77,9 @@ def support_forces(
         carries = balance.pushes[..., 2] > config.force_share
         presses = (np.linalg.norm(balance.pushes, axis=-1) > config.force_share) & ~carries & needed
         fell = np.zeros((count, count), dtype=np.bool_)
-        for k in np.flatnonzero(presses.any(axis=1) & ~scene.fixed):
-            motion = scene.solve(draw, without=int(k)).motion
-            fell[k] = presses[k] & (motion > balance.motion + config.at_rest)
+        for group in scene.independent(np.flatnonzero(presses.any(axis=1) & ~scene.fixed)):
+            motion = scene.solve(draw, without=group).motion
+            fell[group] = presses[group] & (motion > balance.motion + config.at_rest)
         if number == 0:
             needed = fell
         held += (carries | (fell & rests)) * trust
@@ -95,7 +97,7 @@ def moved_without(
     scene, moves = Equilibrium(objects, config), np.zeros(len(objects))
     total = np.zeros(len(objects))
     for draw in scene.draws(rng):
-        before, after = scene.solve(draw).motion, scene.solve(draw, without=index).motion
+        before, after = scene.solve(draw).motion, scene.solve(draw, without=[index]).motion
         trust = np.where(before <= config.at_rest, 1.0, config.unexplained)
         moves += (after > before + config.at_rest) * trust
         total += trust
@@ -271,12 +273,22 @@ class Equilibrium:
         pressed = self.solve(replace(draw, gaps=np.where(far, np.inf, draw.gaps))).pressed
         return far, pressed & (draw.gaps > self._config.at_rest * self._fall)
 
-    def solve(self, draw: Draw, without: int | None = None) -> Balance:
-        """Find the forces that hold a draw, without the object of an index, and what still moves."""
+    def independent(self, indices: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
+        """Divide objects (M,) into groups of which no two touch each other, even through others."""
+        beside = ~self.fixed[self._pairs].any(axis=1)
+        ends, count = self._pairs[beside].T, len(self._objects)
+        graph = coo_array((np.ones(len(ends[0])), tuple(ends)), shape=(count, count))
+        islands = connected_components(graph, directed=False)[1][indices]
+        turns = np.array([np.sum(islands[:k] == island) for k, island in enumerate(islands)], dtype=np.intp)
+        for turn in range(turns.max(initial=-1) + 1):
+            yield indices[turns == turn]
+
+    def solve(self, draw: Draw, without: Sequence[int] | NDArray[np.intp] = ()) -> Balance:
+        """Find the forces that hold a draw without some objects (M,), by index, and what still moves."""
         model, data, count = self._model, self._data, len(self._objects)
         self._set(draw)
         apart = np.isinf(draw.gaps)
-        gone = (apart[:, None] | (self._pairs == without)).any(axis=1)[self._contact]
+        gone = (apart | np.isin(self._pairs, without).any(axis=1))[self._contact]
         data.qacc_warmstart[:] = self._warm
         if len(gone):
             data.contact.exclude[:] = gone
@@ -289,7 +301,7 @@ class Equilibrium:
             mujoco.mj_fwdActuation, mujoco.mj_fwdAcceleration, mujoco.mj_fwdConstraint,
         ):  # fmt: skip
             stage(model, data)
-        if without is None:
+        if not len(without):
             self._warm = data.qacc.copy()
         acceleration = data.qacc.reshape(-1, 6)[:count]
         turning = np.linalg.norm(acceleration[:, 3:], axis=1) * self._reach
