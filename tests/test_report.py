@@ -42,6 +42,7 @@ from caryatid.viz.graph_drawing import arrange, draw_graph, layers
 from caryatid.viz.pdf import render_pdf
 from caryatid.viz.pictures import Tag, keep_apart, picture_svg
 from caryatid.viz.report import Figure, Report, make_report, render_html
+from caryatid.viz.scene_3d import scene_3d_html
 from caryatid.viz.tables import object_table
 
 SMALL = ReportConfig(image_width=160)
@@ -543,3 +544,12 @@ def test_the_page_answers_on_the_first_screen_and_is_short_offline_and_accessibl
     page.close()
     assert errors == []
     assert all(url.startswith(("file:", "data:", "blob:", "about:")) for url in asked)
+
+
+def test_a_browser_without_3d_says_so_in_place_of_the_shapes(browser):
+    page = browser.new_page()
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.goto("about:blank")
+    page.set_content(scene_3d_html(make_graph(), 0.0))
+    page.get_by_text("WebGL is missing").wait_for(timeout=10_000)
+    page.close()

@@ -16,6 +16,12 @@ from caryatid.viz.pictures import DOUBT, INK
 
 LETTER = 0.024
 """Height of a name plate [m]."""
+WITHOUT = "This browser shows no 3D: WebGL is missing or switched off."
+_CHECK = (
+    "<script>if (!document.createElement('canvas').getContext('webgl2'))"
+    f" document.body.replaceChildren('{WITHOUT}');</script>"
+)
+"""What stands in place of the shapes where the browser cannot draw them."""
 
 
 def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
@@ -67,7 +73,7 @@ def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
     T_file_camera = transforms.look_at(eye, centre, (0.0, 1.0, 0.0))
     scene.camera_transform = T_file_camera @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along −z.
     page: str = scene_to_html(scene)
-    return page
+    return page.replace("</body>", f"{_CHECK}</body>")
 
 
 def support_ends(support: Support, graph: SupportGraph) -> tuple[Array, Array]:
