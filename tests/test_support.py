@@ -319,6 +319,13 @@ class TestInfer:
         )
         assert [s.supporter for s in graph.supporters("o2")] == ["o1"]
 
+    def test_what_steep_faces_hold_by_friction_does_not_reach_the_table(self):
+        held = Box(at(-0.0371, 0.0598, 0.0932, (40.59, 0.11, 86.58)), np.array([0.0648, 0.1042, 0.1174]))
+        turned = Box(at(-0.0263, -0.0127, 0.0534, (6.74, 121.27, 126.69)), np.array([0.0958, 0.1048, 0.0627]))
+        upright = Box(at(-0.0698, 0.1592, 0.0322, (-168.09, -64.4, 0.0)), np.array([0.1224, 0.072, 0.0648]))
+        graph = infer(scene(turned, upright, held), CONFIG)
+        assert {s.supporter for s in graph.supporters("o3")} == {"o1", "o2"}
+
     def test_an_object_in_the_air_has_no_supporter(self):
         graph = infer(scene(Sphere(at(0, 0, 0.4), 0.03)), CONFIG)
         assert graph.supports == ()

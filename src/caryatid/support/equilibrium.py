@@ -229,9 +229,9 @@ class Equilibrium:
         scatter = np.einsum("kpv,kpv->k", rows**2, variance[self._pairs]) + config.touch**2
         odds = np.exp(-(np.maximum(found, 0.0) ** 2) / (2.0 * scatter)) * config.reach
         shut = odds / (odds + np.sqrt(2.0 * np.pi * scatter))
-        steepest = np.cos(np.arctan(np.mean(config.friction)))
-        level = np.array([abs(c.normal_world[2]) >= steepest for c in self.contacts], dtype=np.bool_)
-        shut *= level
+        upright = np.array([abs(c.normal_world[2]) for c in self.contacts])
+        shut *= upright >= np.cos(np.arctan(np.mean(config.friction)))
+        walls = upright < np.cos(np.radians(config.max_tilt))
         far, fallen = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         for number in range(config.draws):
             first = number == 0
@@ -256,7 +256,7 @@ class Equilibrium:
             )
             if first:
                 # A wall does not hold an object that falls along it.
-                falling = replace(draw, frictions=np.where(level, draw.frictions, _SMOOTH))
+                falling = replace(draw, frictions=np.where(walls, _SMOOTH, draw.frictions))
                 far, fallen = self._landings(falling)
                 draw = replace(draw, gaps=np.where(far, np.inf, np.where(fallen, 0.0, draw.gaps)))
             yield draw
