@@ -199,6 +199,9 @@ class Equilibrium:
         if not self.fixed.any():
             lifted = [c.b if c.normal_world[2] > 0.0 else c.a for c in self.contacts]
             self.fixed = ~np.isin(np.arange(len(objects)), lifted)
+        ends, count = self._pairs[~self.fixed[self._pairs].any(axis=1)].T, len(objects)
+        graph = coo_array((np.ones(len(ends[0])), tuple(ends)), shape=(count, count))
+        self._islands = connected_components(graph, directed=False)[1]
         self._volumes = np.array([s.volume for s in shapes])
         self._moments = np.array([s.moments for s in shapes]).reshape(-1, 3)
         self._centres = np.array([s.centre_of_mass for s in shapes]).reshape(-1, 3)
@@ -275,10 +278,7 @@ class Equilibrium:
 
     def independent(self, indices: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
         """Divide objects (M,) into groups of which no two touch each other, even through others."""
-        beside = ~self.fixed[self._pairs].any(axis=1)
-        ends, count = self._pairs[beside].T, len(self._objects)
-        graph = coo_array((np.ones(len(ends[0])), tuple(ends)), shape=(count, count))
-        islands = connected_components(graph, directed=False)[1][indices]
+        islands = self._islands[indices]
         turns = np.array([np.sum(islands[:k] == island) for k, island in enumerate(islands)], dtype=np.intp)
         for turn in range(turns.max(initial=-1) + 1):
             yield indices[turns == turn]

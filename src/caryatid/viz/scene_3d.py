@@ -16,12 +16,11 @@ from caryatid.viz.pictures import DOUBT, INK
 
 LETTER = 0.024
 """Height of a name plate [m]."""
-WITHOUT = "This browser shows no 3D: WebGL is missing or switched off."
 _CHECK = (
-    "<script>if (!document.createElement('canvas').getContext('webgl2'))"
-    f" document.body.replaceChildren('{WITHOUT}');</script>"
+    "<script>if (!document.createElement('canvas').getContext('webgl2')) document.body.replaceChildren("
+    "'This browser shows no 3D: WebGL is missing or switched off.');</script>"
 )
-"""What stands in place of the shapes where the browser cannot draw them."""
+"""Says so in place of the shapes where the browser cannot draw them."""
 
 
 def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
