@@ -77,9 +77,6 @@ def segment(
     # Something beside the surface, at its edge or in the room behind, is not an object on it.
     over = surface.pixels_over(view, 0.0, np.inf, 0.0)[samples.grid][samples.places]
     part = _with_share(np.where(wide[part], part, 0), over, 0.5)
-    part, enclosed = merge_insides(samples, part)
-    if odds is not None:
-        part = _with_share(part, odds[-1][samples.places] > 0.0, 0.5)
     uncut, width = samples.image(part), GAP // config.stride
     if view.rgb is not None and samples.rgb is not None:
         least, seam = config.min_area / samples.spacing**2, find_seams(view.rgb, samples.grid)
@@ -87,6 +84,9 @@ def segment(
         facing[samples.places] = normals
         part = cut_at_seams(uncut, facing, seam, width, least)[samples.places]
         part = cut_by_colour(samples.image(part), samples.rgb, least)[samples.places]
+    part, enclosed = merge_insides(samples, part)
+    if odds is not None:
+        part = _with_share(part, odds[-1][samples.places] > 0.0, 0.5)
     part = merge_occluded(samples, part, config, fit_config, rng)
     # Readings of the surface with a common error exceed the clearance, but not by twice as much.
     part = _with_share(part, samples.height > 2.0 * config.clearance, 0.05)
