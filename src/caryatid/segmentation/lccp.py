@@ -325,10 +325,12 @@ def wide_parts(labels: NDArray[np.int32]) -> NDArray[np.bool_]:
 def hollowness(points: Array, normals: Array, part: NDArray[np.integer]) -> Array:
     """How much parts 0 … P − 1 face inwards: mean cosine (P,) of normals to the direction of the middle.
 
-    0 on a plane, positive on the inside of a bowl, negative on the outside. Points are (N, 3) [m].
+    0 on a plane, positive on the inside of a bowl, negative on the outside. Points are (N, 3) [m]; the middle
+    is their median, which a stray piece does not move.
     """
     sizes = np.maximum(np.bincount(part), 1)
-    middles = np.stack([np.bincount(part, x) for x in points.T], axis=-1) / sizes[:, None]
+    every = np.arange(len(sizes))
+    middles = np.stack([ndimage.median(x, part, every) for x in points.T], axis=-1)
     inwards = transforms.unit(middles[part] - points)
     return np.bincount(part, np.einsum("ij,ij->i", inwards, normals)) / sizes
 
