@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from caryatid.config import CloudConfig, Config, FitConfig, SegmentationConfig, SurfaceConfig
 from caryatid.errors import PerceptionError
 from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Cylinder
 from caryatid.scene import Scene
 from caryatid.segmentation.observation import observe
 from caryatid.segmentation.seams import GAP, cut_at_seams, find_seams
@@ -19,6 +20,9 @@ from caryatid.segmentation.segments import cut_by_colour, segment, segment_cloud
 from caryatid.segmentation.support_plane import find_support_surface
 from caryatid.sensing.clouds import oriented_points, thin
 from caryatid.sensing.views import Cloud
+from caryatid.simulation.camera import SimulatedCamera
+from caryatid.simulation.generation import _bowl
+from caryatid.simulation.world import Body, build_spec, scene_from_spec
 
 UP = np.array([0.0, 0.0, 1.0])
 STACK = [
@@ -273,6 +277,33 @@ def test_an_open_box_is_one_object_with_its_bottom_and_its_content_is_another():
     points = view.points_camera @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3]
     bottom = (np.abs(points[..., :2]).max(axis=-1) < 0.08) & (np.abs(points[..., 2] - TABLE) < 0.002)
     assert (labels[bottom] > 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("tint", [(200, 200, 200), (215, 170, 130)], ids=["plain", "reflecting the table"])
+@pytest.mark.parametrize("elevation", [30.0, 40.0])
+def test_a_bowl_is_one_object_around_the_can_that_parts_its_inside(elevation, tint):
+    bowl = _bowl(np.random.default_rng(0)).moved(transforms.rigid(np.eye(3), (0.0, 0.0, TABLE)))
+    can = Cylinder(transforms.rigid(np.eye(3), (0.0, 0.0, TABLE + 0.065)), 0.03, 0.106)
+    scene = scene_from_spec(build_spec([Body(bowl), Body(can)], "test"), "test", "test")
+    view = SimulatedCamera(scene, "carmine").capture(from_the_side(0.0, elevation, distance=0.9))
+    points, normals, pixels = oriented_points(view, CloudConfig())
+    outside = np.zeros(view.depth.size, dtype=bool)
+    outside[pixels] = np.einsum("ij,ij->i", points[:, :2], normals[:, :2]) > 0.0
+    colours = np.where(outside.reshape(view.depth.shape)[..., None], tint, (200, 200, 200))
+    rgb = np.where(view.labels[..., None] == 1, colours, view.rgb)
+    rgb = rgb + np.random.default_rng(0).normal(scale=2.0, size=rgb.shape)
+    labels = parts(replace(view, rgb=np.clip(rgb, 0, 255).astype(np.uint8)))
+    assert found(labels, view.labels) == (2, 2, 2)
+
+
+def test_a_ramp_of_readings_beside_an_edge_is_no_object():
+    """Ten pixels beside the box mix its top and the table 30 cm below it."""
+    tall = (np.array([0.0, 0.0, TABLE + 0.15]), np.array([0.15, 0.2, 0.3]))
+    view = table_scene(from_the_side(0.0, elevation=75.0, distance=1.4), [tall], sigma=0.001)
+    beyond, (row, column) = ndimage.distance_transform_edt(view.labels == 0, return_indices=True)
+    share = np.minimum(beyond / 11.0, 1.0)
+    mixed = 1.0 / ((1.0 - share) / view.depth[row, column] + share / view.depth)
+    assert found(parts(replace(view, depth=mixed.astype(np.float32))), view.labels) == (1, 1, 1)
 
 
 def test_what_stands_beside_the_table_is_no_object_on_it():

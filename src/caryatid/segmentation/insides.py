@@ -29,9 +29,9 @@ ALONG = 0.35
 def merge_insides(samples: Samples, part: Labels) -> tuple[Labels, Mask]:
     """Make one part of each hollow object.
 
-    Pieces beside each other that end at one rim and face each other are one inside. Samples within its hull
-    in the image belong to it too, unless they face outwards as contents do. The outside lies along the hull
-    and does not rise above the rim.
+    Pieces that end at one rim, face each other and meet, or are parted by something nearer alone, are one
+    inside. Samples within its hull in the image belong to it too, unless they face outwards as contents do.
+    The outside lies along the hull and does not rise above the rim.
 
     Returns:
         Part (N,) of each sample, and the places (H, W) within the hulls of insides.
@@ -41,15 +41,12 @@ def merge_insides(samples: Samples, part: Labels) -> tuple[Labels, Mask]:
         return merged, within
     reach = max(2, round(RIM_WIDTH * samples.K[0, 0] / float(np.median(samples.points_camera[:, 2]))))
     top = _tops(samples, merged)
-    into = np.arange(len(top))
-    for first, second in _beside(samples.image(part), reach):
+    alike, into = np.abs(top - top[:, None]) < RIM, np.arange(len(top))
+    for first, second in np.argwhere(np.triu(alike & _facing(samples, part), 1)):
         a, b = into[first], into[second]
-        if a == b or not abs(top[a] - top[b]) < RIM:
-            continue
-        own, other = merged == a, merged == b
-        facing = min(_facing(samples, own, other), _facing(samples, other, own))
-        if facing > HOLLOW and _meet(samples.image(merged), a, b, reach):
-            merged[other], into[into == b] = a, a
+        image = samples.image(merged)
+        if a != b and (_meet(image, a, b, reach) or _parted(samples, image, a, b)):
+            merged[merged == b], into[into == b] = a, a
     look, top = hollowness(samples.points_camera, samples.normals_camera, merged), _tops(samples, merged)
     look[0] = 0.0
     for number in np.flatnonzero(look > HOLLOW).tolist():
@@ -78,20 +75,26 @@ def _tops(samples: Samples, part: Labels) -> Array:
     return tops
 
 
-def _facing(samples: Samples, own: Mask, other: Mask) -> float:
-    """Mean cosine of the normals of some samples (N,) to the direction of the middle of others (N,)."""
-    points = samples.points_camera
-    towards = transforms.unit(points[other].mean(axis=0) - points[own])
-    return float(np.einsum("ij,ij->i", towards, samples.normals_camera[own]).mean())
+def _facing(samples: Samples, part: Labels) -> Mask:
+    """Which of parts 0 … P − 1 of samples (N,) face each other (P, P), by their middles and mean normals."""
+    sizes = np.maximum(np.bincount(part), 1)[:, None]
+    points, normals = (
+        np.stack([np.bincount(part, x) for x in of.T], axis=-1) / sizes
+        for of in (samples.points_camera, samples.normals_camera)
+    )
+    faces = np.einsum("ijk,ik->ij", transforms.unit(points - points[:, None]), normals) > HOLLOW
+    return np.asarray(faces & faces.T)
 
 
-def _beside(image: Labels, reach: int) -> NDArray[np.intp]:
-    """Pairs (K, 2) of parts of an image (H, W) whose rows and columns come within a reach; ascending."""
-    boxes = {number: box for number, box in enumerate(ndimage.find_objects(image), start=1) if box}
-    start = np.array([[own.start - reach for own in box] for box in boxes.values()]).reshape(-1, 2)
-    stop = np.array([[own.stop for own in box] for box in boxes.values()]).reshape(-1, 2)
-    near = (start[:, None] < stop).all(axis=-1)
-    return np.array(list(boxes), dtype=np.intp)[np.argwhere(np.triu(near & near.T, 1))]
+def _parted(samples: Samples, image: Labels, first: int, second: int) -> bool:
+    """Whether nothing but what is nearer lies between the middles of two parts of an image (H, W)."""
+    ends = np.stack([samples.points_camera[image[samples.places] == k].mean(axis=0) for k in (first, second)])
+    pixels = (ends @ samples.K.T)[:, :2] / ends[:, 2:]
+    steps = np.linspace(0.0, 1.0, 2 + int(np.abs(np.diff(pixels, axis=0)).max()))[:, None]
+    column, row = np.rint(pixels[0] + steps * (pixels[1] - pixels[0])).astype(np.intp).T
+    inverse_depth = (1.0 - steps[:, 0]) / ends[0, 2] + steps[:, 0] / ends[1, 2]
+    own = np.isin(image[row, column], (first, second))
+    return bool((own | (samples.depth[row, column] * inverse_depth < 1.0)).all())
 
 
 def _meet(image: Labels, first: int, second: int, reach: int) -> bool:

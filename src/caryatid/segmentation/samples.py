@@ -17,6 +17,9 @@ from caryatid.sensing.views import View
 
 Labels = NDArray[np.int32]
 
+GRAZING = float(np.cos(np.radians(80.0)))
+"""Cosine of the angle of incidence beyond which a sensor reads no surface [1]: such a reading mixes two."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Samples:
@@ -64,7 +67,8 @@ def take_samples(
     """Take oriented points of the foreground, which is not empty, on a grid of pixels.
 
     If the view has no normals of its own, point and normal are those of a plane through the readings around
-    the pixel that ends at creases. The smooth planes of `sensing` are unsuitable: they round creases.
+    the pixel that ends at creases. The smooth planes of `sensing` are unsuitable: they round creases. Planes
+    along the ray are ramps from one surface to another behind it, and are left out.
 
     Args:
         view: The view, which has a pose.
@@ -103,6 +107,8 @@ def take_samples(
         known = (normals != 0.0).any(axis=-1)
         points = (rays * view.depth[row, column].astype(np.float64)[:, None])[known]
         normals = normals[known]
+    seen = -np.einsum("ij,ij->i", normals, transforms.unit(rays[known])) > GRAZING
+    points, normals, known[known] = points[seen], normals[seen], seen
     places[places] = known
     K = view.K.copy()
     K[:2, 2] -= corner[::-1]
