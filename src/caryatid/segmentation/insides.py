@@ -30,8 +30,8 @@ def merge_insides(samples: Samples, part: Labels) -> tuple[Labels, Mask]:
     """Make one part of each hollow object.
 
     Pieces that end at one rim, face each other and meet, or are parted by something nearer alone, are one
-    inside. Samples within its hull in the image belong to it too, unless they face outwards as contents do.
-    The outside lies along the hull and does not rise above the rim.
+    inside if they face inwards together. Samples within its hull in the image belong to it too, unless they
+    face outwards as contents do. The outside lies along the hull and does not rise above the rim.
 
     Returns:
         Part (N,) of each sample, and the places (H, W) within the hulls of insides.
@@ -44,9 +44,12 @@ def merge_insides(samples: Samples, part: Labels) -> tuple[Labels, Mask]:
     alike, into = np.abs(top - top[:, None]) < RIM, np.arange(len(top))
     for first, second in np.argwhere(np.triu(alike & _facing(samples, part), 1)):
         a, b = into[first], into[second]
-        image = samples.image(merged)
-        if a != b and (_meet(image, a, b, reach) or _parted(samples, image, a, b)):
-            merged[merged == b], into[into == b] = a, a
+        both, image = (merged == a) | (merged == b), samples.image(merged)
+        points, normals = samples.points_camera[both], samples.normals_camera[both]
+        if a == b or hollowness(points, normals, np.zeros(len(points), dtype=np.intp))[0] <= HOLLOW:
+            continue
+        if _meet(image, a, b, reach) or _parted(samples, image, a, b):
+            merged[both], into[into == b] = a, a
     look, top = hollowness(samples.points_camera, samples.normals_camera, merged), _tops(samples, merged)
     look[0] = 0.0
     for number in np.flatnonzero(look > HOLLOW).tolist():
