@@ -268,15 +268,29 @@ def open_box(width=0.2, height=0.1, wall=0.01):
 
 
 def test_an_open_box_is_one_object_with_its_bottom_and_its_content_is_another():
-    """The ball's top is 4 cm under the rim, and the bottom lies as low as the table."""
-    ball = (np.array([0.03, 0.0, TABLE + 0.03]), 0.03)
-    view = table_scene(from_the_side(elevation=55.0, distance=1.0), open_box(), [ball], sigma=0.0005)
+    """The content's top is 4 cm under the rim, and the bottom lies as low as the table."""
+    content = (np.array([0.03, 0.0, TABLE + 0.03]), np.array([0.06, 0.06, 0.06]))
+    view = table_scene(from_the_side(elevation=55.0, distance=1.0), [*open_box(), content], sigma=0.0005)
     truth = np.where(view.labels == 5, 2, np.minimum(view.labels, 1))
     labels = parts(view)
     assert found(labels, truth) == (2, 2, 2)
     points = view.points_camera @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3]
     bottom = (np.abs(points[..., :2]).max(axis=-1) < 0.08) & (np.abs(points[..., 2] - TABLE) < 0.002)
-    assert (labels[bottom] > 0).mean() > 0.9
+    box = np.bincount(labels[truth == 1]).argmax()
+    assert (labels[bottom] == box).mean() > 0.9
+
+
+@pytest.mark.parametrize("azimuth", [20.0, 40.0])
+def test_the_walls_of_a_bin_are_no_object(azimuth):
+    """The table top is the floor of the bin; what is seen around it is another floor, 75 cm below."""
+    contents = [
+        (np.array([-0.06, 0.05, TABLE + 0.04]), np.array([0.1, 0.08, 0.08])),
+        (np.array([0.06, -0.06, TABLE + 0.03]), np.array([0.08, 0.1, 0.06])),
+    ]
+    walls = open_box(width=0.5, height=0.18)
+    T = from_the_side(azimuth, elevation=60.0, distance=1.0)
+    view = table_scene(T, [*contents, *walls], sigma=0.001, half_table=(0.25, 0.25))
+    assert found(parts(view), np.where(view.labels > 2, 0, view.labels)) == (2, 2, 2)
 
 
 @pytest.mark.parametrize("tint", [(200, 200, 200), (215, 170, 130)], ids=["plain", "reflecting the table"])

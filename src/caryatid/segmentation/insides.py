@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from caryatid.geometry import transforms
 from caryatid.geometry.polygons import hull
@@ -12,6 +13,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.segmentation.lccp import hollowness
 from caryatid.segmentation.samples import Labels, Samples
 
+Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 MEETING = 5
@@ -22,21 +24,32 @@ RIM = 0.015
 """Heights within which two parts end at one rim [m]: its width, and noise at depth edges."""
 RIM_WIDTH = 0.01
 """Width of a rim, on which samples fail or are mixed with what is behind it [m]."""
+SURROUNDED = 0.25
+"""Share of the support surface that a bin's walls have in their hull, and at most behind them [1]: two walls
+have half in their hull, and contents hide some; a tray on a table has more behind it."""
 ALONG = 0.35
 """Share of the hull of an inside along which its outside is seen [1]; from the side, that of half of it."""
 
 
-def merge_insides(samples: Samples, part: Labels) -> tuple[Labels, Mask]:
+def merge_insides(samples: Samples, part: Labels, floor: Array) -> tuple[Labels, Index]:
     """Make one part of each hollow object.
 
     Pieces that end at one rim, face each other and meet, or are parted by something nearer alone, are one
     inside if they face inwards together. Samples within its hull in the image belong to it too, unless they
     face outwards as contents do. The outside lies along the hull and does not rise above the rim.
 
+    Walls around the support surface, which is the floor of a bin, are no object.
+
+    Args:
+        samples: The samples.
+        part: Part (N,) of each, 0 = none.
+        floor: Readings (M, 3) of the support surface in the camera frame [m].
+
     Returns:
-        Part (N,) of each sample, and the places (H, W) within the hulls of insides.
+        Part (N,) of each sample, and at places (H, W) within the hull of an inside one of its samples, −1
+        elsewhere.
     """
-    merged, within = part.copy(), np.zeros(samples.places.shape, dtype=np.bool_)
+    merged, within = part.copy(), np.full(samples.places.shape, -1)
     if not merged.any():
         return merged, within
     reach = max(2, round(RIM_WIDTH * samples.K[0, 0] / float(np.median(samples.points_camera[:, 2]))))
@@ -62,12 +75,28 @@ def merge_insides(samples: Samples, part: Labels) -> tuple[Labels, Mask]:
         held = (
             (np.bincount(image[inner], minlength=len(look)) >= 0.8 * sizes) & (look > -HOLLOW) & (sizes > 0)
         )
-        possible = ~held & (top < top[number] + RIM) & (look <= HOLLOW)
-        held[_outside(inner, image, possible, reach)] = True
+        outside = _outside(inner, image, ~held & (top < top[number] + RIM) & (look <= HOLLOW), reach)
+        if _surrounds(samples, own, inner, floor):
+            merged[own | (merged == outside)] = 0
+            continue
+        held[outside] = True
         held[0] = False
         merged[held[merged]] = number
-        within |= inner | ndimage.binary_fill_holes(samples.image(merged) == number)
+        within[inner | ndimage.binary_fill_holes(samples.image(merged) == number)] = np.argmax(own)
     return merged, within
+
+
+def _surrounds(samples: Samples, own: Mask, inner: Mask, floor: Array) -> bool:
+    """Whether the walls (N,) of samples, with a hull (H, W), stand around readings of the support surface."""
+    if not len(floor):
+        return False
+    column, row = np.rint((floor @ samples.K.T)[:, :2] / floor[:, 2:]).astype(np.intp).T
+    within = (row >= 0) & (row < inner.shape[0]) & (column >= 0) & (column < inner.shape[1])
+    within[within] = inner[row[within], column[within]]
+    points, normals = samples.points_camera[own], samples.normals_camera[own]
+    nearest = cKDTree(points).query(floor)[1]
+    before = np.einsum("ij,ij->i", floor - points[nearest], normals[nearest]) > 0.0
+    return bool(within.mean() > SURROUNDED and before.mean() > 1.0 - SURROUNDED)
 
 
 def _tops(samples: Samples, part: Labels) -> Array:

@@ -31,6 +31,8 @@ from caryatid.segmentation.seams import GAP, Pairs, cut_at_seams, divided, find_
 from caryatid.segmentation.support_plane import Mask, SupportSurface
 from caryatid.sensing.views import Cloud, View, depth_behind
 
+SPARSE = 8
+"""Pixels between the readings of the support surface among which walls are looked for [1]."""
 SMALLEST = 160
 """Minimum number of samples across an image for the network [1]: it was trained on crops of 192."""
 PLAIN = 0.02
@@ -84,7 +86,10 @@ def segment(
         facing[samples.places] = normals
         part = cut_at_seams(uncut, facing, seam, width, least)[samples.places]
         part = cut_by_colour(samples.image(part), samples.rgb, least)[samples.places]
-    part, enclosed = merge_insides(samples, part)
+    low = surface.pixels_over(view, -config.clearance, config.clearance, config.margin)
+    row, column = np.argwhere(low[::SPARSE, ::SPARSE]).T * SPARSE
+    rays = np.stack([column, row, np.ones(len(row))], axis=-1) @ np.linalg.inv(view.K).T
+    part, inside = merge_insides(samples, part, rays * view.depth[row, column, None])
     if odds is not None:
         part = _with_share(part, odds[-1][samples.places] > 0.0, 0.5)
     part = merge_occluded(samples, part, config, fit_config, rng)
@@ -97,13 +102,10 @@ def segment(
     jump, rounds = np.float32(2.0 * config.edge_jump), 2 * config.stride
     waiting = foreground[around] & (labels[around] == 0)
     _spread_labels(labels[around], np.flatnonzero(waiting), view.depth[around], jump, rounds)
-    if enclosed.any():
-        # The bottom of a bowl is as low as the surface's own readings.
-        low = surface.pixels_over(view, -config.clearance, config.clearance, config.margin)[around]
-        low &= enclosed.repeat(config.stride, 0).repeat(config.stride, 1)[: low.shape[0], : low.shape[1]]
-        waiting = low & (labels[around] == 0)
-        rounds = int(np.sqrt(np.count_nonzero(waiting)))
-        _spread_labels(labels[around], np.flatnonzero(waiting), view.depth[around], jump, rounds)
+    # The bottom of a bowl is as low as the surface's own readings.
+    bottom = np.where(inside >= 0, part[inside], 0).repeat(config.stride, 0).repeat(config.stride, 1)
+    bottom = bottom[: labels[around].shape[0], : labels[around].shape[1]]
+    labels[around] = np.where(low[around] & (labels[around] == 0), bottom, labels[around])
     return labels, apart
 
 
