@@ -280,17 +280,30 @@ def test_an_open_box_is_one_object_with_its_bottom_and_its_content_is_another():
     assert (labels[bottom] == box).mean() > 0.9
 
 
-@pytest.mark.parametrize("azimuth", [20.0, 40.0])
+CONTENTS = [
+    (np.array([-0.06, 0.05, TABLE + 0.04]), np.array([0.1, 0.08, 0.08])),
+    (np.array([0.06, -0.06, TABLE + 0.03]), np.array([0.08, 0.1, 0.06])),
+]
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 20.0, 40.0])
 def test_the_walls_of_a_bin_are_no_object(azimuth):
     """The table top is the floor of the bin; what is seen around it is another floor, 75 cm below."""
-    contents = [
-        (np.array([-0.06, 0.05, TABLE + 0.04]), np.array([0.1, 0.08, 0.08])),
-        (np.array([0.06, -0.06, TABLE + 0.03]), np.array([0.08, 0.1, 0.06])),
-    ]
-    walls = open_box(width=0.5, height=0.18)
     T = from_the_side(azimuth, elevation=60.0, distance=1.0)
-    view = table_scene(T, [*contents, *walls], sigma=0.001, half_table=(0.25, 0.25))
+    walls = open_box(width=0.5, height=0.18)
+    view = table_scene(T, [*CONTENTS, *walls], sigma=0.001, half_table=(0.25, 0.25))
     assert found(parts(view), np.where(view.labels > 2, 0, view.labels)) == (2, 2, 2)
+
+
+@pytest.mark.parametrize("elevation", [20.0, 40.0])
+def test_the_wall_behind_a_table_is_no_object_nor_part_of_what_stands_before_it(elevation):
+    wall = (np.array([-0.31, 0.0, 0.75]), np.array([0.02, 3.0, 1.5]))
+    close = (np.array([-0.26, 0.1, TABLE + 0.05]), np.array([0.08, 0.1, 0.1]))
+    view = table_scene(from_the_side(0.0, elevation), [*CONTENTS, close, wall], sigma=0.001)
+    truth = np.where(view.labels > 3, 0, view.labels)
+    labels = parts(view)
+    assert found(labels, truth) == (3, 3, 3)
+    assert (labels[view.labels == 4] > 0).mean() < 0.002
 
 
 @pytest.mark.parametrize("tint", [(200, 200, 200), (215, 170, 130)], ids=["plain", "reflecting the table"])

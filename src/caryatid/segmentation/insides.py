@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from caryatid.geometry import transforms
 from caryatid.geometry.polygons import hull
@@ -24,26 +23,24 @@ RIM = 0.015
 """Heights within which two parts end at one rim [m]: its width, and noise at depth edges."""
 RIM_WIDTH = 0.01
 """Width of a rim, on which samples fail or are mixed with what is behind it [m]."""
-SURROUNDED = 0.25
-"""Share of the support surface that a bin's walls have in their hull, and at most behind them [1]: two walls
-have half in their hull, and contents hide some; a tray on a table has more behind it."""
 ALONG = 0.35
 """Share of the hull of an inside along which its outside is seen [1]; from the side, that of half of it."""
 
 
-def merge_insides(samples: Samples, part: Labels, floor: Array) -> tuple[Labels, Index]:
+def merge_insides(samples: Samples, part: Labels, floor: Mask, floor_size: float) -> tuple[Labels, Index]:
     """Make one part of each hollow object.
 
     Pieces that end at one rim, face each other and meet, or are parted by something nearer alone, are one
     inside if they face inwards together. Samples within its hull in the image belong to it too, unless they
     face outwards as contents do. The outside lies along the hull and does not rise above the rim.
 
-    Walls around the support surface, which is the floor of a bin, are no object.
+    An inside with most of the support surface in its hull is no object, but the walls of a bin.
 
     Args:
         samples: The samples.
         part: Part (N,) of each, 0 = none.
-        floor: Readings (M, 3) of the support surface in the camera frame [m].
+        floor: Which places (H, W) show the support surface.
+        floor_size: How many places of the whole view do.
 
     Returns:
         Part (N,) of each sample, and at places (H, W) within the hull of an inside one of its samples, −1
@@ -57,10 +54,11 @@ def merge_insides(samples: Samples, part: Labels, floor: Array) -> tuple[Labels,
     alike, into = np.abs(top - top[:, None]) < RIM, np.arange(len(top))
     for first, second in np.argwhere(np.triu(alike & _facing(samples, part), 1)):
         a, b = into[first], into[second]
-        both, image = (merged == a) | (merged == b), samples.image(merged)
+        both = (merged == a) | (merged == b)
         points, normals = samples.points_camera[both], samples.normals_camera[both]
         if a == b or hollowness(points, normals, np.zeros(len(points), dtype=np.intp))[0] <= HOLLOW:
             continue
+        image = samples.image(merged)
         if _meet(image, a, b, reach) or _parted(samples, image, a, b):
             merged[both], into[into == b] = a, a
     look, top = hollowness(samples.points_camera, samples.normals_camera, merged), _tops(samples, merged)
@@ -71,32 +69,19 @@ def merge_insides(samples: Samples, part: Labels, floor: Array) -> tuple[Labels,
             continue
         image = samples.image(merged)
         inner = _hull_of(image == number)
+        if np.count_nonzero(inner & floor) > 0.5 * floor_size:
+            merged[own] = 0
+            continue
         sizes = np.bincount(merged, minlength=len(look))
         held = (
             (np.bincount(image[inner], minlength=len(look)) >= 0.8 * sizes) & (look > -HOLLOW) & (sizes > 0)
         )
-        outside = _outside(inner, image, ~held & (top < top[number] + RIM) & (look <= HOLLOW), reach)
-        if _surrounds(samples, own, inner, floor):
-            merged[own | (merged == outside)] = 0
-            continue
-        held[outside] = True
+        possible = ~held & (top < top[number] + RIM) & (look <= HOLLOW)
+        held[_outside(inner, image, possible, reach)] = True
         held[0] = False
         merged[held[merged]] = number
         within[inner | ndimage.binary_fill_holes(samples.image(merged) == number)] = np.argmax(own)
     return merged, within
-
-
-def _surrounds(samples: Samples, own: Mask, inner: Mask, floor: Array) -> bool:
-    """Whether the walls (N,) of samples, with a hull (H, W), stand around readings of the support surface."""
-    if not len(floor):
-        return False
-    column, row = np.rint((floor @ samples.K.T)[:, :2] / floor[:, 2:]).astype(np.intp).T
-    within = (row >= 0) & (row < inner.shape[0]) & (column >= 0) & (column < inner.shape[1])
-    within[within] = inner[row[within], column[within]]
-    points, normals = samples.points_camera[own], samples.normals_camera[own]
-    nearest = cKDTree(points).query(floor)[1]
-    before = np.einsum("ij,ij->i", floor - points[nearest], normals[nearest]) > 0.0
-    return bool(within.mean() > SURROUNDED and before.mean() > 1.0 - SURROUNDED)
 
 
 def _tops(samples: Samples, part: Labels) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +32,6 @@ from caryatid.segmentation.seams import GAP, Pairs, cut_at_seams, divided, find_
 from caryatid.segmentation.support_plane import Mask, SupportSurface
 from caryatid.sensing.views import Cloud, View, depth_behind
 
-SPARSE = 8
-"""Pixels between the readings of the support surface among which walls are looked for [1]."""
 SMALLEST = 160
 """Minimum number of samples across an image for the network [1]: it was trained on crops of 192."""
 PLAIN = 0.02
@@ -77,8 +76,10 @@ def segment(
     part = convex_parts(points, normals, edges, config, steps, borders)
     wide = wide_parts(samples.image(part))
     # Something beside the surface, at its edge or in the room behind, is not an object on it.
-    over = surface.pixels_over(view, 0.0, np.inf, 0.0)[samples.grid][samples.places]
-    part = _with_share(np.where(wide[part], part, 0), over, 0.5)
+    # A wall at its edge begins where its readings end.
+    over = surface.pixels_over(view, 0.0, np.inf, -config.clearance)[samples.grid][samples.places]
+    proper = wide[part]
+    part = _with_share(np.where(proper, part, 0), over, 0.5)
     uncut, width = samples.image(part), GAP // config.stride
     if view.rgb is not None and samples.rgb is not None:
         least, seam = config.min_area / samples.spacing**2, find_seams(view.rgb, samples.grid)
@@ -87,9 +88,7 @@ def segment(
         part = cut_at_seams(uncut, facing, seam, width, least)[samples.places]
         part = cut_by_colour(samples.image(part), samples.rgb, least)[samples.places]
     low = surface.pixels_over(view, -config.clearance, config.clearance, config.margin)
-    row, column = np.argwhere(low[::SPARSE, ::SPARSE]).T * SPARSE
-    rays = np.stack([column, row, np.ones(len(row))], axis=-1) @ np.linalg.inv(view.K).T
-    part, inside = merge_insides(samples, part, rays * view.depth[row, column, None])
+    part, inside = merge_insides(samples, part, low[samples.grid], np.count_nonzero(low) / config.stride**2)
     if odds is not None:
         part = _with_share(part, odds[-1][samples.places] > 0.0, 0.5)
     part = merge_occluded(samples, part, config, fit_config, rng)
@@ -101,12 +100,19 @@ def segment(
     around = tuple(slice(side.start, side.stop) for side in samples.grid)
     jump, rounds = np.float32(2.0 * config.edge_jump), 2 * config.stride
     waiting = foreground[around] & (labels[around] == 0)
+    left_out = samples.image((proper & (part == 0)).astype(np.int32)) > 0
+    waiting &= ~_enlarged(left_out, config.stride, waiting.shape)
     _spread_labels(labels[around], np.flatnonzero(waiting), view.depth[around], jump, rounds)
     # The bottom of a bowl is as low as the surface's own readings.
-    bottom = np.where(inside >= 0, part[inside], 0).repeat(config.stride, 0).repeat(config.stride, 1)
-    bottom = bottom[: labels[around].shape[0], : labels[around].shape[1]]
-    labels[around] = np.where(low[around] & (labels[around] == 0), bottom, labels[around])
+    bottom = _enlarged(np.where(inside >= 0, part[inside], 0), config.stride, waiting.shape)
+    bottom[~low[around] | (labels[around] > 0)] = 0
+    labels[around] += bottom
     return labels, apart
+
+
+def _enlarged(image: NDArray[Any], stride: int, shape: tuple[int, ...]) -> NDArray[Any]:
+    """An image on the grid of samples in the pixels of a view, cut to a shape."""
+    return image.repeat(stride, 0).repeat(stride, 1)[: shape[0], : shape[1]]
 
 
 def _with_share(part: Labels, own: Mask, least: float) -> Labels:
