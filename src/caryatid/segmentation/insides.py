@@ -31,8 +31,9 @@ def merge_insides(samples: Samples, part: Labels, floor: Mask, floor_size: float
     """Make one part of each hollow object.
 
     Pieces that end at one rim, face each other and meet, or are parted by something nearer alone, are one
-    inside if they face inwards together. Samples within its hull in the image belong to it too, unless they
-    face outwards as contents do. The outside lies along the hull and does not rise above the rim.
+    inside if they face inwards together. Parts within its hull in the image belong to it too, unless they
+    face outwards or stand out as contents do. The outside lies along the hull and does not rise above the
+    rim.
 
     An inside with most of the support surface in its hull is no object, but the walls of a bin.
 
@@ -73,9 +74,9 @@ def merge_insides(samples: Samples, part: Labels, floor: Mask, floor_size: float
             merged[own] = 0
             continue
         sizes = np.bincount(merged, minlength=len(look))
-        held = (
-            (np.bincount(image[inner], minlength=len(look)) >= 0.8 * sizes) & (look > -HOLLOW) & (sizes > 0)
-        )
+        held = np.bincount(image[inner], minlength=len(look)) >= 0.8 * np.maximum(sizes, 1)
+        for other in np.flatnonzero(held & (np.arange(len(look)) != number)).tolist():
+            held[other] = look[other] > -HOLLOW and not _stands_out(image == other, samples)
         possible = ~held & (top < top[number] + RIM) & (look <= HOLLOW)
         held[_outside(inner, image, possible, reach)] = True
         held[0] = False
@@ -138,6 +139,16 @@ def _outside(inner: Mask, image: Labels, possible: Mask, reach: int) -> int:
         if (along := np.count_nonzero(near & contour)) >= most:
             best, most = int(number), float(along)
     return best
+
+
+def _stands_out(own: Mask, samples: Samples) -> bool:
+    """Whether what is around a part of an image (H, W) mostly lies behind it by more than a rim's height."""
+    rows, columns = (slice(max(0, side.start - 3), side.stop + 3) for side in _box(own))
+    own, depth = own[rows, columns], samples.depth[rows, columns]
+    near = ndimage.distance_transform_edt(~own, return_indices=True)
+    ring = (near[0] > 0.0) & (near[0] <= 3.0) & (depth > 0.0)
+    behind = depth[ring] - depth[tuple(near[1][:, ring])]
+    return bool(np.median(behind) > RIM) if ring.any() else False
 
 
 def _hull_of(own: Mask) -> Mask:
