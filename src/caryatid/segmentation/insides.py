@@ -35,7 +35,7 @@ def merge_insides(samples: Samples, part: Labels, floor: Mask, floor_size: float
     face outwards or stand out as contents do. The outside lies along the hull and does not rise above the
     rim.
 
-    An inside with most of the support surface in its hull is no object, but the walls of a bin.
+    An inside with most of the support surface in its hull is the walls of a bin, and left out.
 
     Args:
         samples: The samples.
