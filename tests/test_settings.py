@@ -72,7 +72,7 @@ def test_an_unknown_name_lists_the_valid_ones(flag, listed):
         ("robot.pitch=[1, 2, 3]", "at most 2 items"),
         ("robot.pitch=[low, 2]", "a valid array"),
         ("voxels.size=0", "greater than 0"),
-        ("completion.step=1e-9", "greater than or equal to 0.001"),
+        ("export.corners=7", "greater than or equal to 8"),
         ("support.touch=1e300", "less than or equal to 1000000000000000000"),
         ("voxels.extent=[16, 16, 10]", "take 5.12 GB, more than voxels.max_voxels = 64000000"),
         ("fusion.keep_share=1.01", "less than or equal to 1"),

@@ -272,8 +272,6 @@ class CompletionConfig:
     """Whether unseen faces are extended."""
     max_tilt: Angle = 30.0
     """Maximum angle between an unseen face's normal and straight down [deg]; only such faces bear weight."""
-    step: Annotated[float, Field(ge=1e-3, le=1.0)] = 0.01
-    """Step of the extension [m]; a voxel."""
     overlap: NotNegative = 0.004
     """Maximum overlap of the extended face, or its walls, with another shape [m]; the fits' uncertainty."""
     max_free: Share = 0.15

@@ -38,7 +38,7 @@ def complete(
         objects: Objects without the support surface; `seen` says which sides points confirm.
         surface: The table top.
         voxels: The voxel map.
-        config: Steps and tolerances.
+        config: Tolerances.
     """
     done = list(objects)
     lowest = [o.shape.surface(SPACING)[0][:, 2].min() for o in objects]
@@ -103,7 +103,7 @@ def _moved_out(
     if to_object < length:
         length, reason = to_object, "ends at the next object"
     # A voxel inside the walls, so that their noise does not count.
-    to_free = _free_before(_inwards(rim, across, config.step), outward, length, voxels, config)
+    to_free = _free_before(_inwards(rim, across, voxels.config.size), outward, length, voxels, config)
     if to_free < length:
         length, reason = to_free, "ends at free space"
     if length < LEAST:
@@ -150,11 +150,12 @@ def _free_before(
     rim: Array, outward: Array, limit: float, voxels: VoxelMap, config: CompletionConfig
 ) -> float:
     """How far [m] a rim (M, 3) can move before it lies in space seen free."""
-    lengths = np.append(0.0, np.cumsum(np.full(int(limit / config.step) + 1, config.step)))
-    lengths = lengths[limit - lengths > config.step]
+    step = voxels.config.size
+    lengths = np.append(0.0, np.cumsum(np.full(int(limit / step) + 1, step)))
+    lengths = lengths[limit - lengths > step]
     if not len(lengths):
         return limit
-    middles = rim + (lengths[:, None] + config.step / 2.0)[:, None] * outward
+    middles = rim + (lengths[:, None] + step / 2.0)[:, None] * outward
     free = voxels.state_at(middles.reshape(-1, 3)).reshape(len(lengths), -1) == FREE
     stops = np.flatnonzero(free.mean(axis=1) > config.max_free)
     return float(lengths[stops[0]]) if len(stops) else limit
