@@ -94,6 +94,16 @@ def test_a_table_without_objects_and_a_view_without_readings_have_no_parts():
     assert not parts(replace(view, depth=np.zeros_like(view.depth)), surface_of(view)).any()
 
 
+def test_single_readings_above_the_table_have_no_parts():
+    """No plane goes through any of them, so not one sample is left."""
+    view = table_scene(from_the_side(), [])
+    depth = view.depth.copy()
+    for row, column in ((200, 300), (240, 320), (260, 340)):
+        depth[row - 4 : row + 5, column - 4 : column + 5] = 0.0
+        depth[row, column] = 0.85 * view.depth[row, column]
+    assert not parts(replace(view, depth=depth), surface_of(view)).any()
+
+
 def test_without_a_pose_table_and_parts_are_found_in_the_camera_frame():
     T = from_the_side(distance=1.0)
     view = table_scene(T, STACK, [BALL], sigma=0.001)

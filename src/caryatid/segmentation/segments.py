@@ -75,8 +75,8 @@ def segment(
         borders = partial(affinity_borders, samples, odds, config.alike)
     part = convex_parts(points, normals, edges, config, steps, borders)
     wide = wide_parts(samples.image(part))
-    # Something beside the surface, at its edge or in the room behind, is not an object on it.
-    # A wall at its edge begins where its readings end.
+    # Something beside the surface or in the room behind is not an object on it; nor is a wall at its edge,
+    # which begins where the readings of the surface end.
     over = surface.pixels_over(view, 0.0, np.inf, -config.clearance)[samples.grid][samples.places]
     proper = wide[part]
     part = _with_share(np.where(proper, part, 0), over, 0.5)
@@ -104,7 +104,7 @@ def segment(
     waiting &= ~_enlarged(left_out, config.stride, waiting.shape)
     _spread_labels(labels[around], np.flatnonzero(waiting), view.depth[around], jump, rounds)
     # The bottom of a bowl is as low as the surface's own readings.
-    bottom = _enlarged(np.where(inside >= 0, part[inside], 0), config.stride, waiting.shape)
+    bottom = _enlarged(np.append(part, np.int32(0))[inside], config.stride, waiting.shape)
     bottom[~low[around] | (labels[around] > 0)] = 0
     labels[around] += bottom
     return labels, apart
