@@ -51,7 +51,7 @@ BELOW = thing(2, box((0.1, 0.0, TABLE_TOP + 0.02), (0.15, 0.15, 0.04)))
     [
         (lambda p: p[:, 2] > 9.0, (), TABLE_TOP, 1e-9, "reach down to the table, 60 mm"),
         (lambda p: np.hypot(p[:, 0] - 0.1, p[:, 1]) > 0.07, (), TABLE_TOP, 1e-9, "table"),
-        (lambda p: p[:, 2] < LIMIT, (), LIMIT, 1.5 * CONFIG.step, "free space"),
+        (lambda p: p[:, 2] < LIMIT, (), LIMIT, 1.5 * VoxelConfig().size, "free space"),
         (lambda p: p[:, 2] < 2.0, (), TABLE_TOP + 0.06, 1e-9, ""),
         (lambda p: p[:, 2] > 9.0, (BELOW,), TABLE_TOP + 0.04, CONFIG.overlap, "next object"),
     ],
@@ -117,7 +117,7 @@ def test_a_front_alone_is_taken_to_be_as_deep_as_wide_within_free_space():
     np.testing.assert_allclose(ends, (-0.005 + 0.08, -0.005))
     behind_is_free = seen_free(lambda p: p[:, 0] > 0.04, CENTRE)
     (bounded,) = completed(flat, voxels=behind_is_free)
-    assert bounded.shape.extents[0] == pytest.approx(0.045, abs=1.5 * CONFIG.step)
+    assert bounded.shape.extents[0] == pytest.approx(0.045, abs=1.5 * VoxelConfig().size)
 
 
 def test_among_many_objects_it_reaches_down_to_the_first_one_in_its_way():
