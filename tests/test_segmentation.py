@@ -299,12 +299,15 @@ CONTENTS = [
 ]
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 20.0, 40.0])
-def test_the_walls_of_a_bin_are_no_object(azimuth):
-    """The table top is the floor of the bin; what is seen around it is another floor, 75 cm below."""
-    T = from_the_side(azimuth, elevation=60.0, distance=1.0)
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "half_table"),
+    [(0.0, 60.0, 0.25), (20.0, 60.0, 0.25), (40.0, 60.0, 0.25), (40.0, 85.0, 0.3)],
+)
+def test_the_walls_of_a_bin_are_no_object(azimuth, elevation, half_table):
+    """The table top is the floor of the bin, and at most 5 cm of it lie outside; below is another floor."""
+    T = from_the_side(azimuth, elevation, distance=1.0)
     walls = open_box(width=0.5, height=0.18)
-    view = table_scene(T, [*CONTENTS, *walls], sigma=0.001, half_table=(0.25, 0.25))
+    view = table_scene(T, [*CONTENTS, *walls], sigma=0.001, half_table=(half_table, half_table))
     assert found(parts(view), np.where(view.labels > 2, 0, view.labels)) == (2, 2, 2)
 
 

@@ -9,10 +9,9 @@ from scipy import ndimage
 from caryatid.geometry import transforms
 from caryatid.geometry.polygons import hull
 from caryatid.geometry.transforms import Array
-from caryatid.segmentation.lccp import hollowness
+from caryatid.segmentation.lccp import Index, hollowness
 from caryatid.segmentation.samples import Labels, Samples
 
-Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 MEETING = 5
