@@ -196,10 +196,13 @@ def _turned(R, c, s):  # type: ignore[no-untyped-def]
 @inner
 def _range(points, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Lowest and highest coordinate [m] of points (N, 3) along a direction, without a share at each end."""
-    along = np.empty(len(points))
+    along, low, high = np.empty(len(points)), np.inf, -np.inf
     for i in range(len(points)):
         along[i] = points[i, 0] * dx + points[i, 1] * dy + points[i, 2] * dz
+        low, high = min(low, along[i]), max(high, along[i])
     beyond = min(int(TRIM * len(points)), (len(points) - 1) // 2)
+    if beyond == 0:
+        return low, high
     return select(along, beyond), select(along, len(points) - 1 - beyond)
 
 

@@ -53,7 +53,8 @@ class Polytope:
         a, b, c = np.moveaxis(vertices[triangles], 1, 0)
         inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0.0
         triangles[inward] = triangles[inward][:, ::-1]
-        edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        low, high = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).T
+        edges = np.stack(np.divmod(np.unique(low * len(vertices) + high), len(vertices)), axis=1)
         return cls(vertices, triangles, hull.equations.copy(), edges, float(hull.volume))
 
     @property
@@ -256,6 +257,8 @@ def hollowed(part: Polytope, cavity: Sequence[tuple[Array, float]]) -> list[Poly
     Returns:
         The pieces; the part itself if the cavity does not reach it.
     """
+    if any((part.vertices @ normal).max() <= offset for normal, offset in cavity):
+        return [part]
     pieces, rest = [], part
     for normal, offset in cavity:
         behind, before = rest.cut(normal, offset)
