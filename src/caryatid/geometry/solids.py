@@ -54,6 +54,7 @@ class Polytope:
         inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0.0
         triangles[inward] = triangles[inward][:, ::-1]
         low, high = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).T
+        # One number for each edge: rows take longer to sort.
         edges = np.stack(np.divmod(np.unique(low * len(vertices) + high), len(vertices)), axis=1)
         return cls(vertices, triangles, hull.equations.copy(), edges, float(hull.volume))
 

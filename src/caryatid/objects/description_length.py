@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import chain
 
 import numpy as np
@@ -221,14 +220,9 @@ def explain(
         rng: Source of the samples.
         first_look: Make a quick fit, which only tells what is worth a full one.
     """
-    settings = _fit_settings(fit_config, first_look)
+    if first_look:
+        settings = replace(fit_config, polish=1, hypotheses=10, steps=6, max_points=150)
+    else:
+        settings = replace(fit_config, polish=1, search_points=fit_config.max_points)
     fits = candidates(evidence.points, evidence.normals, config=settings, rng=rng, whole=False)
     return best_explanation([f.shape for f in fits], evidence, config)
-
-
-@lru_cache
-def _fit_settings(config: FitConfig, first_look: bool) -> FitConfig:
-    """Settings of the fits that explain points; checking them takes as long as a tenth of a quick fit."""
-    if first_look:
-        return replace(config, polish=1, hypotheses=10, steps=6, max_points=150)
-    return replace(config, polish=1, search_points=config.max_points)
