@@ -17,13 +17,13 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.polygons import area
 from caryatid.geometry.shapes import Box, Cylinder, Sphere, Uncertainty
-from caryatid.geometry.transforms import rigid
+from caryatid.geometry.transforms import UP, rigid
 from caryatid.graph import SceneObject
-from caryatid.support.contacts import find_contacts, find_gap
+from caryatid.support.contacts import Contact, find_contacts, find_gap
 from caryatid.support.equilibrium import support_forces
 from caryatid.support.plausibility import closing, drawn, reconcile
 from caryatid.support.relations import explain, infer, predict_removal
-from caryatid.support.stability import contact_patch, ground_outline
+from caryatid.support.stability import contact_patch
 
 CONFIG = SupportConfig()
 PAPER = replace(CONFIG, stability="area")
@@ -170,34 +170,39 @@ class TestContacts:
                 find_contacts([cube(0, 0, 0), cube(0, 0, 0.1)], bad)
 
 
+def patch_of(shape, other, normal_world, points=((0.0, 0.0, 0.0),)):
+    points = np.array(points)
+    contact = Contact(0, 1, (other, shape), points, points.mean(axis=0), normal_world, 0.0)
+    return contact_patch(contact, CONFIG)
+
+
 class TestPolygons:
     def test_contact_patch_of_a_ball_is_a_small_disc_and_its_outline_a_large_one(self):
         ball = Sphere(at(0.1, 0.2, 0.04), 0.04)
-        patch = contact_patch(ball, TABLE, np.array([0.0, 0.0, 1.0]), np.zeros((1, 3)), CONFIG)
+        patch = patch_of(ball, TABLE, UP)
         depth = CONFIG.patch_depth
         assert area(patch) == pytest.approx(np.pi * depth * (0.08 - depth), rel=0.01)
         np.testing.assert_allclose(patch.mean(axis=0), (0.1, 0.2), atol=1e-9)
-        assert area(ground_outline(ball)) == pytest.approx(np.pi * 0.04**2, rel=0.01)
+        assert area(ball.footprint()) == pytest.approx(np.pi * 0.04**2, rel=0.01)
         slope = block(0, 0, 0, (0.4, 0.4, 0.02), (40, 30, 0))
         normal_world = slope.T_world_object[:3, 2]
         steep = Sphere(rigid(np.eye(3), slope.T_world_object[:3, 3] + 0.05 * normal_world), 0.04)
-        disc = contact_patch(steep, slope, normal_world, np.zeros((1, 3)), CONFIG)
+        disc = patch_of(steep, slope, normal_world)
         assert area(disc) == pytest.approx(area(patch) * normal_world[2], rel=1e-6)
         touching = steep.T_world_object[:3, 3] - (0.04 - depth) * normal_world
         np.testing.assert_allclose(disc.mean(axis=0), touching[:2], atol=1e-9)
         lying = Cylinder(at(0, 0, 0.03, (90, 0, 0)), 0.03, 0.2)
-        np.testing.assert_allclose(np.ptp(ground_outline(lying), axis=0), (0.06, 0.2), atol=1e-3)
+        np.testing.assert_allclose(np.ptp(lying.footprint(), axis=0), (0.06, 0.2), atol=1e-3)
 
     def test_a_long_face_that_is_turned_still_touches_all_over(self):
         long = block(0, 0, 0, (0.3, 0.05, 0.05), (0, 0.9, 0))
         steep = block(0, 0, 0, (0.3, 0.05, 0.05), (0, 3, 0))
-        up = np.array([0.0, 0.0, 1.0])
-        assert np.ptp(contact_patch(long, TABLE, up, np.zeros((1, 3)), CONFIG)[:, 0]) > 0.29
-        assert np.ptp(contact_patch(steep, TABLE, up, np.zeros((1, 3)), CONFIG)[:, 0]) < 0.15
+        assert np.ptp(patch_of(long, TABLE, UP)[:, 0]) > 0.29
+        assert np.ptp(patch_of(steep, TABLE, UP)[:, 0]) < 0.15
 
     def test_where_the_caps_do_not_overlap_the_contact_points_stand_in(self):
         points = np.array([[0.0, 0.0, 0.1], [0.1, 0.0, 0.1], [0.0, 0.1, 0.1]])
-        apart = contact_patch(cube(1, 0, 0.1), cube(0, 0, 0), np.array([0.0, 0.0, 1.0]), points, CONFIG)
+        apart = patch_of(cube(1, 0, 0.1), cube(0, 0, 0), UP, points)
         assert area(apart) == pytest.approx(0.005)
 
 

@@ -5,6 +5,7 @@ A new kind of shape derives from `Shape`; `from_size` then knows it by its name.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -14,10 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.errors import InputError
-from caryatid.geometry import BOX, CYLINDER, SPHERE, transforms
+from caryatid.geometry import BOX, CYLINDER, SPHERE, polygons, transforms
 from caryatid.geometry.signed_distance import distances_and_gradients, sample_surface, signed_distances
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.display import Pictured
+
+_BOX_EDGES = np.array([(i, i + bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
+_CYLINDER_EDGES = np.concatenate(
+    [[(i, i + 24), (i, (i + 1) % 24), (i + 24, (i + 1) % 24 + 24)] for i in range(24)]
+)
+"""Edges (E, 2) between the points of the outline of a box, and of the prism that stands for a cylinder."""
 
 KINDS: dict[str, type[Shape]] = {}
 """Every kind of shape by its name, as in graph.json."""
@@ -72,6 +79,21 @@ class Shape(Pictured):
     @abstractmethod
     def outline(self) -> Array:
         """Points (N, 3) [m] whose convex hull is the shape (to 1 % for round ones)."""
+
+    def footprint(self) -> Array:
+        """Outline (M, 2) [m] of the shape projected to the ground: P_A of eq. 1."""
+        return polygons.hull(self.outline())
+
+    def cap(self, direction_world: Array, depth: float) -> Array:
+        """Outline (M, 2) [m], on the ground, of the part near its end along a direction.
+
+        By default that of the box around it.
+
+        Args:
+            direction_world: Unit vector (3,).
+            depth: How far the part reaches from the outermost point [m].
+        """
+        return Box(self.T_world_object, self.extents).cap(direction_world, depth)
 
     def resized(self, T_world_object: Array, extents: Array) -> Self:
         """Return the shape with another pose (4, 4) and full extents (3,) [m]."""
@@ -233,6 +255,10 @@ class Box(Shape):
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
         return transforms.transform(self.T_world_object, signs * self.extents / 2.0)
 
+    def cap(self, direction_world: Array, depth: float) -> Array:
+        """Outline (M, 2) [m], on the ground, of the part near its end along a direction (3,)."""
+        return polygons.cap(self.outline(), _BOX_EDGES, direction_world, depth)
+
     def mesh(self, corners: int = 48) -> Any:
         """The box as a `trimesh.Trimesh` in its own frame."""
         import trimesh
@@ -285,6 +311,10 @@ class Cylinder(Shape):
         ring = np.stack([self.radius * np.cos(angle), self.radius * np.sin(angle), np.zeros(24)], axis=-1)
         end = np.array([0.0, 0.0, self.height / 2.0])
         return transforms.transform(self.T_world_object, np.concatenate([ring + end, ring - end]))
+
+    def cap(self, direction_world: Array, depth: float) -> Array:
+        """Outline (M, 2) [m], on the ground, of the part near its end along a direction (3,)."""
+        return polygons.cap(self.outline(), _CYLINDER_EDGES, direction_world, depth)
 
     def mesh(self, corners: int = 48) -> Any:
         """The cylinder as a `trimesh.Trimesh` in its own frame."""
@@ -340,6 +370,17 @@ class Sphere(Shape):
     def outline(self) -> Array:
         """Points (400, 3) [m] on the sphere."""
         return self.T_world_object[:3, 3] + self.radius * fibonacci_sphere(400)
+
+    def footprint(self) -> Array:
+        """Outline (64, 2) [m] of the ball projected to the ground."""
+        return self.cap(transforms.UP, self.radius)
+
+    def cap(self, direction_world: Array, depth: float) -> Array:
+        """Rim (64, 2) [m], on the ground, of the part near its end along a direction (3,)."""
+        depth = min(depth, self.radius)
+        middle_world = self.T_world_object[:3, 3] + (self.radius - depth) * direction_world
+        rim = math.sqrt(depth * (2.0 * self.radius - depth))
+        return polygons.hull(_circle(middle_world, direction_world, rim)[:-1])
 
     def mesh(self, corners: int = 48) -> Any:
         """The ball as a `trimesh.Trimesh` in its own frame; its radius is right to 1 %."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from caryatid.geometry import transforms
+from caryatid.geometry import polygons, transforms
 from caryatid.geometry.shapes import Box, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import kernel
@@ -197,6 +197,10 @@ class Solid(Shape):
     def outline(self) -> Array:
         """Corners (N, 3) [m] of all parts."""
         return transforms.transform(self.T_world_object, np.concatenate([p.vertices for p in self.polytopes]))
+
+    def cap(self, direction_world: Array, depth: float) -> Array:
+        """Outline (M, 2) [m], on the ground, of the part near its end along a direction (3,); of one part."""
+        return polygons.cap(self.outline(), self.polytopes[0].edges, direction_world, depth)
 
     def surface(self, spacing: float) -> tuple[Array, Array]:
         """Points (N, 3) [m] about `spacing` metres apart all over the surface, and outward normals (N, 3)."""

@@ -15,7 +15,6 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.sensing.voxel_map import UNKNOWN, Occluders, VoxelMap
-from caryatid.support.stability import ground_outline
 
 SPACE = "unseen space"
 """Subject of a sample of unseen space."""
@@ -117,7 +116,7 @@ def space_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
     T, half = table.shape.T_world_object, table.shape.extents / 2.0
     points = points[(np.abs((points - T[:3, 3]) @ T[:3, :2]) <= half[:2]).all(axis=1)]
 
-    outlines = [ground_outline(o.shape) for o in graph.objects if o.role == "object"]
+    outlines = [o.shape.footprint() for o in graph.objects if o.role == "object"]
     heap = shapely.Polygon(hull(np.concatenate(outlines)))
     shapely.prepare(heap)
     worth = 1.0 - (points[:, 2] - low[2]) / (high[2] - low[2])

@@ -14,7 +14,6 @@ from caryatid.graph import SupportGraph
 from caryatid.planning.expected_visibility import SPACE, Samples, surface_samples
 from caryatid.sensing.voxel_map import UNKNOWN, VoxelMap
 from caryatid.support.relations import predict_removal
-from caryatid.support.stability import ground_outline
 
 
 def relevant(graph: SupportGraph, goal: str) -> set[str]:
@@ -38,7 +37,7 @@ def matter(samples: Samples, graph: SupportGraph, goal: str | None) -> NDArray[n
     if not _knows(goal, graph):
         return np.ones(len(samples.weights), dtype=np.bool_)
     ids = relevant(graph, goal)
-    outlines = [ground_outline(o.shape) for o in graph.objects if o.role == "object" and o.id in ids]
+    outlines = [o.shape.footprint() for o in graph.objects if o.role == "object" and o.id in ids]
     near = shapely.contains_xy(shapely.Polygon(hull(np.concatenate(outlines))), samples.points_world[:, :2])
     about, space = (np.isin(samples.names, names)[samples.subjects] for names in ([*ids], [SPACE]))
     return about | (space & near)

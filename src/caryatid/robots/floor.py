@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from caryatid.config import RobotConfig
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
-from caryatid.support.stability import ground_outline
 
 STEP = 0.02
 """Anything lower than this on the floor is not an obstacle to the platform [m]."""
@@ -63,7 +62,7 @@ class FloorGrid:
             middle, reach = box.T_world_object[2, 3], box.support(np.array([[0.0, 0.0, 1.0]]))[0]
             if middle + reach > STEP and middle - reach < head:
                 # A cell is as far from an outline as its centre is from the outline grown by the cell.
-                grown = (ground_outline(box)[:, None] + corners).reshape(-1, 2)
+                grown = (box.footprint()[:, None] + corners).reshape(-1, 2)
                 free &= shapely.distance(shapely.MultiPoint(grown).convex_hull, cells) >= config.footprint
         return cls(free, origin, config.cell, tuple(furniture))
 

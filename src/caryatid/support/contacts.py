@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import mujoco
@@ -31,7 +31,7 @@ class Contact:
 
     Attributes:
         a: Index of the first shape.
-        b: Index of the second shape; a < b.
+        b: Index of the second shape.
         parts: The convex parts of both; of most shapes the shape itself.
         points_world: Contact points (K, 3) [m], midway between the two surfaces.
         point_world: Their centre (3,) [m].
@@ -47,6 +47,15 @@ class Contact:
     normal_world: Array
     distance: float
 
+    @property
+    def tilt(self) -> float:
+        """Angle of the normal to the vertical [deg]: b lies on top of a at 0, and below it at 180."""
+        return float(np.degrees(np.arccos(np.clip(self.normal_world[2], -1.0, 1.0))))
+
+    def reversed(self) -> Contact:
+        """The same contact, seen from b to a."""
+        return replace(self, a=self.b, b=self.a, parts=self.parts[::-1], normal_world=-self.normal_world)
+
 
 def find_contacts(shapes: Sequence[Shape], margin: float) -> list[Contact]:
     """Find every pair of shapes whose gap is at most the margin.
@@ -56,7 +65,7 @@ def find_contacts(shapes: Sequence[Shape], margin: float) -> list[Contact]:
         margin: Largest gap [m].
 
     Returns:
-        One contact per pair of convex parts, sorted by (a, b) and the parts' numbers.
+        One contact per pair of convex parts, a < b, sorted by (a, b) and the parts' numbers.
 
     Raises:
         InputError: The margin is negative.

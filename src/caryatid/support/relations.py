@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -16,27 +16,6 @@ from caryatid.graph import CERTAIN, LIKELY, Kind, SceneObject, Stability, Suppor
 from caryatid.support.contacts import Contact, find_gap
 from caryatid.support.equilibrium import moved_without, support_forces, touching
 from caryatid.support.stability import assess
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Touch:
-    """How one object touches another one.
-
-    Attributes:
-        other: The other object.
-        contact: The contact.
-        normal_world: Unit normal (3,) of the separating plane, away from the other object.
-        tilt: Angle of the normal to the vertical [deg]; 0 lies on top, 180 lies below.
-    """
-
-    other: SceneObject
-    contact: Contact
-    normal_world: Array
-    tilt: float
-
-    def __str__(self) -> str:
-        gap = self.contact.distance
-        return f"{_gap(gap)}, normal {self.tilt:.0f}° from the vertical"
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +64,8 @@ def infer(
         return _by_area(ordered, config)
     found = support_forces(ordered, config, rng or np.random.default_rng(0))
     supports = [
-        _support(t, ordered[b], float(found.shares[a, b]), found.forces[a, b], config)
-        for (a, b), t in sorted(_touches(ordered, found.contacts).items())
+        _support(ordered, c, config, float(found.shares[a, b]), found.forces[a, b])
+        for (a, b), c in sorted(_nearest(ordered, found.contacts).items())
         if found.shares[a, b] >= LIKELY
     ]
     below = {s.pair for s in supports if s.kind == "bottom-up"}
@@ -121,15 +100,15 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
         return f"{edge.why} Probability {edge.probability:.2f}." if known else edge.why
     if graph.objects[b].role == "support_surface":
         return f"{supported} is the support surface: nothing supports it."
-    touch = _touches(graph.objects, touching(graph.objects, config.reach)).get((a, b))
+    contact = _nearest(graph.objects, touching(graph.objects, config.reach)).get((a, b))
     head = f"{supporter} does not support {supported}"
-    if touch is None:
+    if contact is None:
         gap = find_gap(graph.objects[a].shape, graph.objects[b].shape)
         return f"{head}: they do not touch, {_gap(gap)}."
     if config.stability == "area":
-        return f"{head}: it is not below it ({touch})."
+        return f"{head}: it is not below it ({_described(contact)})."
     share = support_forces(graph.objects, config, np.random.default_rng(0)).shares[a, b]
-    return f"{head}: {supported} rests without it ({touch}). Probability {share:.2f}."
+    return f"{head}: {supported} rests without it ({_described(contact)}). Probability {share:.2f}."
 
 
 def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) -> tuple[Effect, ...]:
@@ -171,53 +150,57 @@ def _loss(graph: SupportGraph, object_id: str, gone: set[str]) -> str:
     return f"it loses the support of {', '.join(lost)}" if lost else "the forces on it change"
 
 
-def _touches(objects: Sequence[SceneObject], contacts: Iterable[Contact]) -> Mapping[tuple[int, int], Touch]:
-    """The nearest contact of each pair (A, B) of objects, as B, which is not the surface, touches A."""
-    touches: dict[tuple[int, int], Touch] = {}
-    for c in contacts:
-        for a, b, sign in ((c.a, c.b, 1.0), (c.b, c.a, -1.0)):
-            if objects[b].role == "support_surface":
-                continue
-            if (a, b) not in touches or c.distance < touches[a, b].contact.distance:
-                normal_world = sign * c.normal_world
-                tilt = float(np.degrees(np.arccos(np.clip(normal_world[2], -1.0, 1.0))))
-                touches[a, b] = Touch(objects[a], c, normal_world, tilt)
-    return touches
+def _nearest(objects: Sequence[SceneObject], contacts: Iterable[Contact]) -> dict[tuple[int, int], Contact]:
+    """The nearest contact of each pair (a, b) of objects, seen from a to b, which is not the surface."""
+    nearest: dict[tuple[int, int], Contact] = {}
+    for contact in contacts:
+        for c in (contact, contact.reversed()):
+            on_object = objects[c.b].role != "support_surface"
+            if on_object and ((c.a, c.b) not in nearest or c.distance < nearest[c.a, c.b].distance):
+                nearest[c.a, c.b] = c
+    return nearest
 
 
 def _by_area(objects: tuple[SceneObject, ...], config: SupportConfig) -> SupportGraph:
     """The supports by the rules of the paper: separating planes and eq. 1."""
-    touches = _touches(objects, touching(objects, config.contact_margin))
-    below = {pair: t for pair, t in touches.items() if t.tilt <= config.max_tilt}
+    nearest = _nearest(objects, touching(objects, config.contact_margin))
+    below = {pair: c for pair, c in nearest.items() if c.tilt <= config.max_tilt}
     stability: dict[str, Stability] = {}
-    supports = {pair: _support(t, objects[pair[1]], None, None, config) for pair, t in below.items()}
+    supports = {pair: _support(objects, c, config) for pair, c in below.items()}
     for k, o in enumerate(objects):
         if o.role == "support_surface":
             continue
-        patches = [polygons.hull(t.contact.points_world) for (_, b), t in below.items() if b == k]
+        patches = [polygons.hull(c.points_world) for (_, b), c in below.items() if b == k]
         stability[o.id] = assess(o.shape, patches, config)
         if not stability[o.id].stable:
             riders = {(b, a) for a, b in below if a == k} - supports.keys()
-            supports |= {pair: _support(touches[pair], o, None, None, config) for pair in riders}
+            supports |= {pair: _support(objects, nearest[pair], config) for pair in riders}
     return SupportGraph(objects, tuple(supports[pair] for pair in sorted(supports)), stability)
 
 
 def _support(
-    t: Touch, o: SceneObject, share: float | None, force: Array | None, config: SupportConfig
+    objects: Sequence[SceneObject],
+    contact: Contact,
+    config: SupportConfig,
+    share: float | None = None,
+    force: Array | None = None,
 ) -> Support:
-    """The support of an object by what it touches, with a probability [1] and a force (3,) [its weight]."""
-    a, b = t.other.id, o.id
-    kind: Kind = "lean" if t.tilt < 180.0 - config.max_tilt else "top-down"
-    kind = "bottom-up" if t.tilt <= config.max_tilt else kind
-    weight = "" if force is None else f" with {np.linalg.norm(force):.2f} times its weight"
-    why = {
-        "bottom-up": f"{b} rests on {a}{weight} ({t}).",
-        "lean": f"{b} leans on {a}{weight} ({t}).",
-        "top-down": f"{a} holds {b} down ({t}).",
-    }[kind]
+    """The support of b by a across a contact, with a probability [1] and a force (3,) [weight of b]."""
+    a, b, tilt = objects[contact.a].id, objects[contact.b].id, contact.tilt
+    kind: Kind = "lean" if tilt < 180.0 - config.max_tilt else "top-down"
+    kind = "bottom-up" if tilt <= config.max_tilt else kind
+    verb = {"bottom-up": f"{b} rests on {a}", "lean": f"{b} leans on {a}", "top-down": f"{a} holds {b} down"}
+    weight = (
+        "" if force is None or kind == "top-down" else f" with {np.linalg.norm(force):.2f} times its weight"
+    )
+    why = f"{verb[kind]}{weight} ({_described(contact)})."
     certain = kind == "bottom-up" if share is None else share >= CERTAIN
     support = Support(a, b, kind, certain, why=why, probability=share)
-    return replace(support, contact_world=t.contact.point_world, normal_world=t.normal_world)
+    return replace(support, contact_world=contact.point_world, normal_world=contact.normal_world)
+
+
+def _described(contact: Contact) -> str:
+    return f"{_gap(contact.distance)}, normal {contact.tilt:.0f}° from the vertical"
 
 
 def _gap(gap: float) -> str:
