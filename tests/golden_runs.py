@@ -87,7 +87,7 @@ def execute(name: str, folder: Path) -> dict[str, bytes]:
 
 
 def summary(graph: bytes) -> dict[str, Any]:
-    """What a golden graph says: shapes with sizes and places to 0.1 mm, and the support edges."""
+    """What a golden graph says: shapes with sizes and places to 0.1 mm, and supports, sure or doubtful."""
     document = json.loads(graph)
     return {
         "objects": {
@@ -99,7 +99,8 @@ def summary(graph: bytes) -> dict[str, Any]:
             for o in document["objects"]
         },
         "supports": sorted(
-            [s["supporter"], s["supported"], s["kind"], s["certain"]] for s in document["supports"]
+            [s["supporter"], s["supported"], s["kind"], s.get("probability", s["certain"]) >= 0.9]
+            for s in document["supports"]
         ),
     }
 

@@ -39,7 +39,7 @@ def without_times(outcome: Outcome) -> Outcome:
 
 def row(view: int, f1: float, path: float = 0.0) -> dict[str, float]:
     figures = {**dict.fromkeys(MEASURES, f1), "path": path, "lifts": 0.0, "unharmed": 0.0}
-    return {"view": view, **figures, "forecasts": [[float(f1), 1.0, True], [0.4, 0.5, False]]}
+    return {"view": view, **figures, "forecasts": [[float(f1), True], [0.4, False]]}
 
 
 def member(scene: str = "tower", method: str = "support", seed: int = 0, kind: str = "designed") -> Member:
@@ -266,16 +266,16 @@ def test_figures_by_hand(method, quantity, at, expected):
 
 def test_how_good_probabilities_are_by_hand():
     """Two scenes, the other one twice as large; a true support that is missing counts in the Brier score."""
-    one = [[0.95, 1.0, True], [0.92, 1.0, True], [0.42, 0.5, False], [0.0, 0.0, True]]
-    two = [[0.95, 1.0, False], [1.0, 1.0, True], [0.48, 0.5, False], [0.95, 1.0, True]] * 2
+    one = [[0.95, True], [0.92, True], [0.42, False], [0.0, True]]
+    two = [[0.95, False], [1.0, True], [0.48, False], [0.95, True]] * 2
     rows = table({"a": [("one", [0.5]), ("two", [0.5])]})
     rows["forecasts"] = [one, two]
     summary = summarise(rows, reference="a")
-    said, by_certain, true = np.array(one + two).T
+    said, true = np.array(one + two).T
     errors = (said - true) ** 2
     assert figure(summary, "a", "pooled brier", 1).value == pytest.approx(np.mean(errors))
     assert figure(summary, "a", "listed brier", 1).value == pytest.approx(np.mean(errors[said > 0.0]))
-    gain = 1.0 - np.sum(errors[said > 0.0]) / np.sum((by_certain - true)[said > 0.0] ** 2)
+    gain = 1.0 - np.sum(errors[said > 0.0]) / np.sum((np.where(said < 0.9, 0.5, 1.0) - true)[said > 0.0] ** 2)
     assert figure(summary, "a", "brier gain", 1).value == pytest.approx(gain)
     low, high = (0.42 + 2 * 0.48) / 3, (0.95 + 0.92 + 2 * (0.95 + 1.0 + 0.95)) / 8
     for quantity, expected in (("reliability 1", [0.0, 6 / 8]), ("supports 1", [3, 8])):

@@ -206,13 +206,14 @@ def test_what_was_said_of_an_object_taken_for_another_counts_for_that():
     assert {s.pair: s.occurrences for s in fused.supports} == {("o1", "o2"): 2, ("o0", "o1"): 1}
 
 
-def test_a_support_that_a_view_lacks_is_not_certain():
+def test_a_support_that_a_view_lacks_is_doubtful():
     likely = replace(FULL, supports=tuple(replace(s, probability=1.0) for s in FULL.supports))
     fused = fused_graph((likely, likely, graph(("o0", "o1"))), replace(SG, keep_share=0.5))
-    assert fused.support("o0", "o1").certain
+    assert not fused.support("o0", "o1").doubtful
     support = fused.support("o1", "o2")
     assert support.probability == pytest.approx(2.0 / 3.0)
-    assert not support.certain
+    assert support.certain
+    assert support.doubtful
 
 
 # What is a change

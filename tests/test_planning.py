@@ -396,7 +396,7 @@ def over_cube(x, y, z):
 def test_a_goal_is_settled_once_it_is_known_what_moves_and_that_nothing_unseen_rests_on_it(
     probability, unseen, expected, monkeypatch
 ):
-    moves = {"o1": (Effect("o2", True, "", probability),), "o2": ()}
+    moves = {"o1": (Effect("o2", "", probability),), "o2": ()}
     monkeypatch.setattr("caryatid.planning.goals.predict_removal", lambda _, goal, __: moves[goal])
     supports = (replace(ON_TABLE, probability=0.7), Support("o1", "o2", probability=probability))
     graph = SupportGraph((TABLE, CUBE, RIDER), supports)

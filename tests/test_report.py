@@ -61,7 +61,7 @@ def make_graph() -> SupportGraph:
     ball = SceneObject("o7", 7, Sphere(at(0.2, 0.2, TOP + 0.04), 0.04), occurrences=1, opportunities=2)
     supports = (
         Support("o0", "o1", occurrences=2, opportunities=2, why="the table lies below <o1>"),
-        Support("o1", "o2", occurrences=1, opportunities=2, probability=0.83),
+        Support("o1", "o2", occurrences=1, opportunities=2, probability=0.93),
         Support("o0", "o2", certain=False, occurrences=1, opportunities=5, why="o2 tips"),
         Support("o2", "o1", "top-down", certain=False, occurrences=3, opportunities=4),
     )
@@ -183,7 +183,7 @@ def test_it_names_each_object_edge_figure_and_setting(report, html):
         "View 1", "View 2", "0.900", "F1 over views", "Found so far", "How it went", "no change",
         "Sees o2 & o7 best", "The graph did not change", "12 too low", "Removal", "image_width=160",
         "masks: simulator · caryatid <1>",
-        "1 object removed. 3 objects, 4 supports, 2 of them uncertain after 2 views",
+        "1 object removed. 3 objects, 4 supports, 2 of them doubtful after 2 views",
         "Wrong supports: o0 → o2; missing supports: o1 → o7, o0 → lid; wrong objects: o7; "
         "missing objects: lid", "wrong 0.50", "missing",
         "160 × 180 × 100", "Run <script>alert(1)</script>", "a<b>.xml", "view <7> & more",
@@ -230,7 +230,7 @@ def test_the_pdf_says_what_the_page_says_and_has_the_same_bytes_each_time(report
     text = " ".join(" ".join(sheet.extract_text() for sheet in pdf.pages).split())
     for said in (
         "Run <script>alert(1)</script> $x$", "a<b>.xml", "view <7> & more", "the table lies", "F1 0.900",
-        "top-down 0.50", "sees o2 & o7 best", "The graph did not change", "uncertain", "o7", "seen once <i>",
+        "top-down 0.50", "sees o2 & o7 best", "The graph did not change", "doubtful", "o7", "seen once <i>",
         "How it went", "F1 over views", "Removal", "Camera image", "wrong 0.50",
     ):  # fmt: skip
         assert said in text, said
@@ -346,13 +346,13 @@ def test_the_chosen_view_and_the_points_of_interest_are_on_the_sphere(make_step)
 def test_doubt_is_told_in_the_graph_without_colour():
     graph = make_graph()
     svg = picture_svg(draw_graph(graph))
-    dashed = re.findall(r'<g class="edge (\w+ \w+) uncertain">.*?</g>', svg, re.DOTALL)
+    dashed = re.findall(r'<g class="edge (\w+ \w+) doubtful">.*?</g>', svg, re.DOTALL)
     assert dashed == ["o0 o2", "o2 o1"]
     for kind, content in re.findall(r'<g class="(edge [^"]*)">(.*?)</g>', svg, re.DOTALL):
-        assert ("stroke-dasharray" in content) == kind.endswith(" uncertain")
+        assert ("stroke-dasharray" in content) == kind.endswith(" doubtful")
     assert re.findall(r'class="node (\w+) unsupported"', svg) == ["o7"]
     words = Page(svg).text
-    for note in ("1.00", "0.83", "0.50", "top-down 0.50"):
+    for note in ("1.00", "0.93", "0.50", "top-down 0.50"):
         assert note in words
     widths = dict(re.findall(r'<g class="edge (\w+ \w+) \w+">.*?stroke-width: ([\d.]+)', svg, re.DOTALL))
     assert float(widths["o0 o2"]) < float(widths["o1 o2"]) < float(widths["o0 o1"])

@@ -100,7 +100,7 @@ def test_probabilities_by_hand():
     assert found.brier == pytest.approx(sum(squares) / 5)
     assert found.average_precision == pytest.approx((1 / 1 + 2 / 3 + 3 / 4) / 4)
     assert sorted(found.forecasts) == [
-        (0.0, 0.0, True), (0.5, 0.5, True), (0.6, 0.5, True), (0.7, 1.0, False), (0.9, 0.5, True)
+        (0.0, True), (0.5, True), (0.6, True), (0.7, False), (0.9, True)
     ]  # fmt: skip
     # What says nothing of a probability: supports of objects that are not there.
     strange = Support("o0", "o9", probability=0.9)
@@ -119,7 +119,7 @@ def test_probabilities_by_hand():
     ],
 )
 def test_average_precision_of_few(said, expected):
-    assert average_precision([Forecast(p, p, true) for p, true in said]) == expected
+    assert average_precision([Forecast(p, true) for p, true in said]) == expected
 
 
 def turned(extents, *degrees):

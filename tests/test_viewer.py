@@ -207,7 +207,7 @@ def test_what_is_said_of_an_object(step, settings):
     assert "no object falls" in describe_object(graph, "o2", config)
     assert "Without" not in describe_object(graph, "o0", config)
     doubtful = with_supports(step, Support("o1", "o2", certain=False)).graph
-    said = "o1 → o2</dt><dd>bottom-up, probability 0.50, uncertain, 1 of 1 views"
+    said = "o1 → o2</dt><dd>bottom-up, probability 0.50, doubtful, 1 of 1 views"
     assert said in describe_object(doubtful, "o1", config)
     assert "not found" in describe_object(graph, "o9", config)
     assert "was removed" in describe_object(graph, "o9", config, taken=True)

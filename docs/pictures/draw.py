@@ -111,7 +111,7 @@ def planes(step: Step, supports: Sequence[Support]) -> Picture:
             at, normal = support.contact_world, support.normal_world
             if at is None or normal is None:
                 continue
-            colour = "#3b4252" if support.certain else "#d55e00"
+            colour = "#d55e00" if support.doubtful else "#3b4252"
             u = transforms.perpendicular(normal)
             v = np.cross(normal, u)
             corners = [at + PLANE * (a * u + b * v) for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]

@@ -212,7 +212,7 @@ def _graphml(graph: SupportGraph) -> str:
 
 
 def to_dot(graph: SupportGraph) -> str:
-    """Write the support graph as DOT, drawn as in the report: the table below, uncertain supports dashed."""
+    """Write the support graph as DOT, drawn as in the report: the table below, doubtful supports dashed."""
     lines = ["digraph supports {", "  rankdir=BT;", '  node [style=filled, fontname="sans-serif"];']
     for item in graph.objects:
         colour = object_colour(item.label)
@@ -226,7 +226,7 @@ def to_dot(graph: SupportGraph) -> str:
         lines.append(f"  {_quoted(item.id)} [{_listed(attributes)}];")
     for support in graph.supports:
         attributes = {
-            "style": "solid" if support.certain else "dashed",
+            "style": "dashed" if support.doubtful else "solid",
             "penwidth": f"{max(0.6, 2.4 * support.belief):.2f}",
             "label": f"{'' if support.kind == 'bottom-up' else f'{support.kind} '}{support.belief:.2f}",
             "tooltip": f"{support.kind}, found in {support.occurrences} of {support.opportunities} views",

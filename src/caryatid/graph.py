@@ -1,4 +1,4 @@
-"""The support graph: objects with their shapes, and which supports which, certain or uncertain."""
+"""The support graph: objects with their shapes, and which supports which, how probably."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ ChangeKind = Literal["removed", "moved", "added"]
 """What happens to objects."""
 LIKELY = 0.5
 """Minimum probability of a support in a graph [1]."""
-CERTAIN = 0.9
-"""Minimum probability of a support that is certain [1]."""
+DOUBTFUL = 0.9
+"""Probability below which a support is doubtful [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -75,7 +75,7 @@ class Support:
         supporter: Id of the object that supports.
         supported: Id of the object that is supported.
         kind: `bottom-up` from below, `lean` from the side, `top-down` by weight from above.
-        certain: Whether its probability is at least `CERTAIN`; without one, whether it holds from below.
+        certain: Whether its probability is at least `LIKELY`; without one, whether it holds from below.
         occurrences: How many times it was extracted and matched: #occ(e) of eq. 2.
         opportunities: How many times both its ends were extracted.
         contact_world: Centre (3,) [m] of the contact patch, or None.
@@ -106,6 +106,11 @@ class Support:
         if self.probability is None:
             return 1.0 if self.certain else 0.5
         return self.probability
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether its `belief` is below `DOUBTFUL`."""
+        return self.belief < DOUBTFUL
 
     def __repr__(self) -> str:
         found = f"found in {self.occurrences} of {self.opportunities}"
@@ -166,7 +171,7 @@ class SupportGraph(Pictured):
         return graph
 
     def __repr__(self) -> str:
-        edges = [f"{s.supporter} → {s.supported}{'' if s.certain else '?'}" for s in self.supports]
+        edges = [f"{s.supporter} → {s.supported}{'?' * s.doubtful}" for s in self.supports]
         told = edges if len(edges) <= 8 else [*edges[:7], "…"]
         counts = f"vertices={len(self.objects)}, edges={len(edges)}"
         return f"SupportGraph({counts}{': ' if told else ''}{', '.join(told)})"

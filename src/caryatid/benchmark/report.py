@@ -31,7 +31,7 @@ Column = tuple[str, float]
 BY_VIEW = {"f1": "F1", "edge_f1": "F1 of edges", "mean_iou": "Mean IoU", "path": "Path [m]"}
 CALIBRATION = {
     "listed brier": "Brier score of the supports in the graph, all scenes together",
-    "brier gain": "How much lower it is than with certain = 1, uncertain = 0.5",
+    "brier gain": "How much lower it is than with doubtful = 0.5, others = 1",
     "calibration error": "Expected calibration error of the supports in the graph",
     "pooled brier": "Brier score including the true supports that the graph lacks",
 }

@@ -15,6 +15,7 @@ import numpy as np
 from caryatid.benchmark.episodes import MEASURES, TIMES
 from caryatid.benchmark.store import import_pandas
 from caryatid.geometry.transforms import Array
+from caryatid.graph import DOUBTFUL
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,7 +51,7 @@ def summarise(table: pd.DataFrame, *, reference: str, gap: tuple[str, str] | Non
         `median path`, `mean path` and `path ratio` (`at`: threshold of F1); `area` under F1 over the path up
         to `budget` [m]; `planning` and `perception` [s] (`at`: quantile); `scenes`, `episodes`, `failed`, and
         `paired scenes`, `paired episodes`. Of the supports of all scenes together: `listed brier` of
-        those in the graph, `brier gain` of these over certain = 1, uncertain = 0.5, `calibration error`, and
+        those in the graph, `brier gain` of these over doubtful = 0.5, others = 1, `calibration error`, and
         `pooled brier` with those that are missing (`at`: view); and of each bin at each VIEW `reliability
         VIEW`, the share that is true, and `supports VIEW`, how many (`at`: mean probability).
 
@@ -228,11 +229,12 @@ def _calibration(episodes: pd.DataFrame) -> Iterator[Statistic]:
 
 def _sums(forecasts: Sequence[Sequence[float]]) -> Array:
     """Number of missing supports; both squared errors of the others, and their sums by bin."""
-    table = np.array(forecasts, dtype=np.float64).reshape(-1, 3)
-    said, by_certain, true = table[table[:, 0] > 0.0].T
+    table = np.array(forecasts, dtype=np.float64).reshape(-1, 2)
+    said, true = table[table[:, 0] > 0.0].T
     bins = np.minimum(BINS * said, BINS - 1).astype(int)
     binned = [np.bincount(bins, of, BINS) for of in (np.ones(len(bins)), said, true)]
-    squares = ((said - true) ** 2).sum(), ((by_certain - true) ** 2).sum()
+    simple = np.where(said < DOUBTFUL, 0.5, 1.0)
+    squares = ((said - true) ** 2).sum(), ((simple - true) ** 2).sum()
     return np.concatenate([[len(table) - len(said), *squares], *binned])
 
 

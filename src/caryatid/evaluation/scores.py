@@ -47,12 +47,10 @@ class Forecast(NamedTuple):
 
     Attributes:
         probability: Probability of the support; 0 if the graph lacks it [1].
-        by_certain: Probability from `certain` alone: 1 if certain, 0.5 if not [1].
         true: Whether the support is in the ground truth.
     """
 
     probability: float
-    by_certain: float
     true: bool
 
 
@@ -124,7 +122,7 @@ def score(
 ) -> Score:
     """Score a graph of fitted shapes against true ones.
 
-    Every edge of the graph counts, uncertain ones too: a wrong guess costs precision. An edge is true if both
+    Every edge of the graph counts, doubtful ones too: a wrong guess costs precision. An edge is true if both
     ends are matched and the directed pair is in the ground truth, whatever its kind.
 
     Args:
@@ -191,11 +189,7 @@ def _matched(
     if graph.support_surface is not None and table is not None:
         matches[graph.support_surface.id] = table
     found = {(matches.get(s.supporter, ""), matches.get(s.supported, "")): s for s in graph.supports}
-    judged = {
-        pair: Forecast(s.belief, 1.0 if s.certain else 0.5, pair in edges)
-        for pair, s in found.items()
-        if all(pair)
-    }
+    judged = {pair: Forecast(s.belief, pair in edges) for pair, s in found.items() if all(pair)}
     v, e = len(matches), sum(forecast.true for forecast in judged.values())
     claimed_v, claimed_e = len(graph.objects), len(graph.supports)
     precision, recall = _ratios(v + e, claimed_v + claimed_e, len(vertices) + len(edges))
@@ -204,7 +198,7 @@ def _matched(
     f1 = _harmonic_mean(precision, recall)
     there = set(matches.values())
     missed = [pair for pair in edges if there.issuperset(pair) and pair not in judged]
-    forecasts = (*judged.values(), *[Forecast(0.0, 0.0, True)] * len(missed))
+    forecasts = (*judged.values(), *[Forecast(0.0, True)] * len(missed))
     brier = float(np.mean([(f.probability - f.true) ** 2 for f in forecasts])) if forecasts else 0.0
     of_forecasts = brier, average_precision(forecasts)
     shares = precision, recall, f1, *of_edges, *of_vertices, mean_iou, *of_forecasts
@@ -226,7 +220,7 @@ def average_precision(forecasts: Sequence[Forecast]) -> float:
     Returns:
         In [0, 1]; 1 if there is nothing to find and nothing is found, 0 if only false ones are found.
     """
-    said, _, true = np.array(forecasts, dtype=np.float64).reshape(-1, 3).T
+    said, true = np.array(forecasts, dtype=np.float64).reshape(-1, 2).T
     order = np.argsort(-said, kind="stable")[: np.count_nonzero(said)]
     steps = np.flatnonzero(np.diff(said[order], append=-1.0))
     hits = np.cumsum(true[order])[steps]

@@ -256,7 +256,7 @@ class Box(Shape):
         return transforms.transform(self.T_world_object, signs * self.extents / 2.0)
 
     def cap(self, direction_world: Array, depth: float) -> Array:
-        """Outline (M, 2) [m], on the ground, of the part near its end along a direction (3,)."""
+        """Outline (M, 2) [m] on the ground of the part within `depth` [m] of its end in a direction (3,)."""
         return polygons.cap(self.outline(), _BOX_EDGES, direction_world, depth)
 
     def mesh(self, corners: int = 48) -> Any:
@@ -313,7 +313,7 @@ class Cylinder(Shape):
         return transforms.transform(self.T_world_object, np.concatenate([ring + end, ring - end]))
 
     def cap(self, direction_world: Array, depth: float) -> Array:
-        """Outline (M, 2) [m], on the ground, of the part near its end along a direction (3,)."""
+        """Outline (M, 2) [m] on the ground of the part within `depth` [m] of its end in a direction (3,)."""
         return polygons.cap(self.outline(), _CYLINDER_EDGES, direction_world, depth)
 
     def mesh(self, corners: int = 48) -> Any:
@@ -376,7 +376,10 @@ class Sphere(Shape):
         return self.cap(transforms.UP, self.radius)
 
     def cap(self, direction_world: Array, depth: float) -> Array:
-        """Rim (64, 2) [m], on the ground, of the part near its end along a direction (3,)."""
+        """Rim (64, 2) [m] on the ground of the part within `depth` [m] of its end in a direction (3,).
+
+        That of a part deeper than the radius is a great circle.
+        """
         depth = min(depth, self.radius)
         middle_world = self.T_world_object[:3, 3] + (self.radius - depth) * direction_world
         rim = math.sqrt(depth * (2.0 * self.radius - depth))

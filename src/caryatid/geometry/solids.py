@@ -199,7 +199,10 @@ class Solid(Shape):
         return transforms.transform(self.T_world_object, np.concatenate([p.vertices for p in self.polytopes]))
 
     def cap(self, direction_world: Array, depth: float) -> Array:
-        """Outline (M, 2) [m], on the ground, of the part near its end along a direction (3,); of one part."""
+        """Outline (M, 2) [m] on the ground of the part within `depth` [m] of its end in a direction (3,).
+
+        Of one convex part only.
+        """
         return polygons.cap(self.outline(), self.polytopes[0].edges, direction_world, depth)
 
     def surface(self, spacing: float) -> tuple[Array, Array]:

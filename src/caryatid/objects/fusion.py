@@ -15,7 +15,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
-from caryatid.graph import CERTAIN, LIKELY, SUPPORT_SURFACE_ID, SceneObject, Support, SupportGraph, object_id
+from caryatid.graph import LIKELY, SUPPORT_SURFACE_ID, SceneObject, Support, SupportGraph, object_id
 
 Pair = tuple[str, str]
 Graphs = tuple[SupportGraph, ...]
@@ -110,12 +110,10 @@ def fused_graph(
         if (mostly and config.method != "pc") or (newest in found and config.method != "sg"):
             last = found[max(found)]
             certain = last.certain if config.method != "sg" else any(s.certain for s in found.values())
-            if last.probability is not None:
-                if views and (newest not in found or config.method == "sg"):
-                    # A view that did not find it counts 0.
-                    likely = sum(found[v].belief for v in views & found.keys()) / len(views)
-                    last = replace(last, probability=likely)
-                certain = last.belief >= CERTAIN
+            if last.probability is not None and views and (newest not in found or config.method == "sg"):
+                # A view that did not find it counts 0.
+                likely = sum(found[v].belief for v in views & found.keys()) / len(views)
+                last = replace(last, probability=likely)
             if last.belief < LIKELY:
                 continue
             supports.append(replace(last, certain=certain, occurrences=occurrences, opportunities=len(views)))

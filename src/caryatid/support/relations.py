@@ -12,7 +12,7 @@ from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.geometry import polygons
 from caryatid.geometry.transforms import Array
-from caryatid.graph import CERTAIN, LIKELY, Kind, SceneObject, Stability, Support, SupportGraph
+from caryatid.graph import LIKELY, Kind, SceneObject, Stability, Support, SupportGraph
 from caryatid.support.contacts import Contact, find_gap
 from caryatid.support.equilibrium import moved_without, support_forces, touching
 from caryatid.support.stability import assess
@@ -24,13 +24,11 @@ class Effect:
 
     Attributes:
         object_id: Its id.
-        certain: Whether its probability is at least `CERTAIN`.
         why: What it loses, for a person to read.
         probability: Probability that it moves [1].
     """
 
     object_id: str
-    certain: bool
     why: str
     probability: float
 
@@ -133,7 +131,7 @@ def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) 
         raise InputError(object_id, "is the support surface", "ask about one of the objects on it")
     moves = moved_without(graph.objects, index, config, np.random.default_rng(0))
     moving = {o.id: float(p) for o, p in zip(graph.objects, moves, strict=True) if p > 0.0}
-    effects = [Effect(i, p >= CERTAIN, _loss(graph, i, {object_id, *moving}), p) for i, p in moving.items()]
+    effects = [Effect(i, _loss(graph, i, {object_id, *moving}), p) for i, p in moving.items()]
     return tuple(sorted(effects, key=lambda e: -e.probability))
 
 
@@ -194,7 +192,7 @@ def _support(
         "" if force is None or kind == "top-down" else f" with {np.linalg.norm(force):.2f} times its weight"
     )
     why = f"{verb[kind]}{weight} ({_described(contact)})."
-    certain = kind == "bottom-up" if share is None else share >= CERTAIN
+    certain = share is not None or kind == "bottom-up"
     support = Support(a, b, kind, certain, why=why, probability=share)
     return replace(support, contact_world=contact.point_world, normal_world=contact.normal_world)
 

@@ -28,8 +28,8 @@ LAYERS = {
     "cloud": False, "sphere": False, "interest": False, "robot": False,
 }  # fmt: skip
 """Layers that can be shown and hidden, and whether they are visible at first."""
-CERTAIN, UNCERTAIN = (26, 32, 40), (196, 78, 12)
-"""Colours of supports; uncertain ones are dashed too."""
+SURE, DOUBTFUL = (26, 32, 40), (196, 78, 12)
+"""Colours of supports; doubtful ones are dashed too."""
 EARLIER, NEXT, BY_HAND = (128, 136, 146), (11, 92, 148), (170, 30, 120)
 """Colours of earlier views, the planner's choice, and one by hand."""
 EARLIER_POINTS = 10_000
@@ -144,7 +144,7 @@ class SceneDrawing:
             "robot": (step.robot, steps[-2] if len(steps) > 1 else None),
         }
         for each in steps:
-            colour = CERTAIN if each is steps[-1] else EARLIER
+            colour = SURE if each is steps[-1] else EARLIER
             layers[f"cameras/{each.index + 1}"] = f"{each.index + 1}", each.view, None, colour
         if decision is not None:
             colour = BY_HAND if decision.why == "chosen by hand" else NEXT
@@ -254,10 +254,10 @@ class SceneDrawing:
         return self._scene.add_arrows(name, np.array([[start, end]]), colour, **look)
 
     def _supports(self, graph: SupportGraph, eye_world: Array) -> list[Any]:
-        """Arrows from name to name, on top of the shapes; not where the table certainly supports."""
+        """Arrows from name to name, on top of the shapes; of the table only if doubtful."""
         nodes: list[Any] = []
         for number, support in enumerate(graph.supports):
-            if graph[support.supporter].role == "support_surface" and support.certain:
+            if graph[support.supporter].role == "support_surface" and not support.doubtful:
                 continue
             start, end = (
                 _nearer(eye_world, self.anchors.get(name, end))
@@ -270,14 +270,14 @@ class SceneDrawing:
             across = float(np.linalg.norm(np.cross(along, end - eye_world))) / size  # As long as it looks.
             gap = min(0.6 * LETTER * size / max(across, 1e-6), 0.3)  # Names stay readable.
             start, end, middle = start + gap * along, end - gap * along, (start + end) / 2.0
-            colour, share = CERTAIN if support.certain else UNCERTAIN, max(support.belief, 0.3)
+            colour, share = DOUBTFUL if support.doubtful else SURE, max(support.belief, 0.3)
             neck = start
-            if not support.certain:
+            if support.doubtful:
                 neck = end - min(2.0 * size * ARROW["head_length"] / length, 0.5) * (end - start)
                 count = max(2, round(float(np.linalg.norm(neck - start)) / 0.016))
                 dashes = np.linspace(start, neck, 2 * count).reshape(-1, 2, 3)
                 nodes += self._lines(
-                    f"/supports/dashes {number}", dashes, UNCERTAIN, thickness=0.007 * size * share
+                    f"/supports/dashes {number}", dashes, DOUBTFUL, thickness=0.007 * size * share
                 )
             nodes.append(self._arrow(f"/supports/arrow {number}", neck, end, colour, share, size))
             kind = "" if support.kind == "bottom-up" else f"{support.kind} "
@@ -322,7 +322,7 @@ class SceneDrawing:
         if view is not None and following is None:
             T_world_camera = view.T_world_camera
             look = {"image": image_of(view), "format": "jpeg", "variant": "wireframe"}
-            look["scale"] = 0.06 if colour == CERTAIN else 0.04
+            look["scale"] = 0.06 if colour == SURE else 0.04
         if view is None or T_world_camera is None:
             return []
         height, width = view.depth.shape

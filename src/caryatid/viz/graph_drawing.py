@@ -61,7 +61,7 @@ def arrange(graph: SupportGraph) -> tuple[dict[str, Place], dict[Pair, list[Plac
 def layers(graph: SupportGraph) -> dict[str, int]:
     """Layer of each object in the support order: 0 for the table, else one more than its highest supporter.
 
-    Edges count in the order certain bottom-up, uncertain bottom-up, lean, top-down (turned round, for what
+    Edges count in the order bottom-up, doubtful bottom-up, lean, top-down (turned round, for what
     presses from above lies higher); one that would close a circle is left out.
     """
     order = nx.DiGraph()
@@ -69,7 +69,7 @@ def layers(graph: SupportGraph) -> dict[str, int]:
     rank = {"bottom-up": 0, "lean": 2, "top-down": 3}
     pairs = [
         support.pair[::-1] if support.kind == "top-down" else support.pair
-        for support in sorted(graph.supports, key=lambda s: rank[s.kind] + (not s.certain))
+        for support in sorted(graph.supports, key=lambda s: rank[s.kind] + s.doubtful)
     ]
     if graph.support_surface is not None:
         table = graph.support_surface.id
@@ -118,7 +118,7 @@ def draw_graph(
 ) -> Picture:
     """Draw the support graph: the table below, what it carries above it, doubt in dashes.
 
-    Edges run from supporter to supported and carry their probability, the thicker the higher it is; uncertain
+    Edges run from supporter to supported and carry their probability, the thicker the higher it is; doubtful
     ones are dashed, leaning and top-down ones say so. Vertices have the shape of their primitive, and a
     dashed rim where nothing is known to support them.
 
@@ -183,10 +183,10 @@ def _put_edge(axes: Axes, support: Support, points: Array, word: str, place: Arr
     from matplotlib.patches import FancyArrowPatch
     from matplotlib.path import Path
 
-    colour = WRONG if marked else INK if support.certain else DOUBT
-    solid = support.certain and support.belief > 0.0
+    colour = WRONG if marked else DOUBT if support.doubtful else INK
+    solid = not support.doubtful
     title = f"{support.supporter} supports {support.supported}: {support.why}".rstrip(": ")
-    kind = f"edge {support.supporter} {support.supported} {'certain' if support.certain else 'uncertain'}"
+    kind = f"edge {support.supporter} {support.supported} {'doubtful' if support.doubtful else 'sure'}"
     corners = [points[0]]
     for a, b in pairwise(points):
         middle = (a[1] + b[1]) / 2.0

@@ -98,7 +98,7 @@ def _cell_of(shown: object) -> Section:
 
 def _graph_cell(title: str, lead: str, graph: SupportGraph, *others: Figure) -> Section:
     """A graph and its tables, with other pictures beside it."""
-    drawn = Figure("", draw_graph(graph), "supporter → supported, with its probability; dashed: uncertain")
+    drawn = Figure("", draw_graph(graph), "supporter → supported, with its probability; dashed: doubtful")
     figures = [drawn, *others] if graph.objects else others
     return Section(title, lead, figures, tables=[object_table(graph), support_table(graph)])
 

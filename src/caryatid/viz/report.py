@@ -14,7 +14,7 @@ from PIL import Image
 
 from caryatid.config import Config, ReportConfig
 from caryatid.geometry.transforms import Array
-from caryatid.graph import Change, SupportGraph
+from caryatid.graph import DOUBTFUL, Change, SupportGraph
 from caryatid.manipulation.dismantling import Taken
 from caryatid.sensing.views import Cloud, View
 from caryatid.simulation.camera import intrinsics, render
@@ -34,7 +34,6 @@ from caryatid.viz.tables import (
     point_table,
     sentence,
     support_table,
-    uncertain_supports,
 )
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ if TYPE_CHECKING:
 
 SUPPORTS = (
     "Arrows run from supporter to supported, labelled with the probability of the support; thicker is more "
-    "probable. Dashed arrows are uncertain; an object with a dashed outline has no known supporter."
+    "probable. Dashed arrows are doubtful; an object with a dashed outline has no known supporter."
 )
 """Caption of a support graph."""
 WIDE = 680.0
@@ -110,7 +109,7 @@ class Report:
     Attributes:
         title: Heading.
         about: Conditions, version and date of the run.
-        sections: Answer, what is uncertain, how it went, removal, and folded: tables, views, settings.
+        sections: Answer, what is doubtful, how it went, removal, and folded: tables, views, settings.
     """
 
     title: str
@@ -194,7 +193,7 @@ def _in_words(change: Change) -> str:
 def _answer(
     step: Step, shown: Step, views: int, score: Mapping[str, Any] | None, width: int, before: str
 ) -> Iterator[Section]:
-    """The final graph beside the view of the step that shows most objects, in 3D, and what is uncertain."""
+    """The final graph beside the view of the step that shows most objects, in 3D, and what is doubtful."""
     graph, truth, facts = step.graph, score or {}, []
     text = f"{before}{census(graph)} after {count_of(views, 'view')}."
     if score is not None:
@@ -221,16 +220,14 @@ def _answer(
         seen = Figure("The objects", draw_image(shown.view, shown.labels, graph, width), caption)
     figures = [supports, seen] if wide else [seen, supports]
     if graph.objects:
-        caption = "Drag to rotate, scroll to zoom. Arrows are visible through objects; orange: uncertain."
+        caption = "Drag to rotate, scroll to zoom. Arrows are visible through objects; orange: doubtful."
         page = scene_3d_html(graph, azimuth)
         figures.append(Figure("In 3D" if wide else "", solid, caption, share=2 if wide else 1, page=page))
     yield Section("Answer", text, figures if wide else figures[:2], facts)
     doubtful = doubts(graph)
-    text = (
-        "" if doubtful else "Nothing: all supports have a probability of at least 0.95, and all shapes fit."
-    )
+    nothing = f"Nothing: all supports have a probability of at least {DOUBTFUL}, and all shapes fit."
     more = [("More", f"{len(doubtful) - MOST} others; see the tables.")] if len(doubtful) > MOST else []
-    yield Section("What is uncertain", text, facts=doubtful[:MOST] + more)
+    yield Section("What is doubtful", "" if doubtful else nothing, facts=doubtful[:MOST] + more)
     if figures[2:] and not wide:
         yield Section("In 3D", figures=figures[2:])
 
@@ -246,7 +243,7 @@ def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> lis
         found = {
             "objects": [sum(o.role == "object" for o in graph.objects) for graph in graphs],
             "supports": [len(graph.supports) for graph in graphs],
-            "uncertain supports": [uncertain_supports(graph) for graph in graphs],
+            "doubtful supports": [sum(s.doubtful for s in graph.supports) for graph in graphs],
         }
         charts.append(draw_chart("Found so far", "number", found))
     figures = [Figure("", chart, share=3) for chart in charts]

@@ -27,7 +27,7 @@ def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
     """Write a page on which the mouse turns the shapes, with arrows from supporter to supported.
 
     Objects are translucent, so that arrows show through them. Arrows are the thicker the more probable their
-    support is; uncertain ones have another colour. Each object has its name on two opposite sides.
+    support is; doubtful ones have another colour. Each object has its name on two opposite sides.
 
     Args:
         graph: The shapes and their supports, of at least one object.
@@ -61,7 +61,7 @@ def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
         for side, turn in (("front", 0.0), ("back", np.pi)):
             add(f"name of {item.id}, {side}", *_plate(item, azimuth + turn))
     for number, support in enumerate(graph.supports):
-        look = _material(rgb(INK if support.certain else DOUBT), 255)
+        look = _material(rgb(DOUBT if support.doubtful else INK), 255)
         arrow = _arrow(*support_ends(support, graph), 0.0035 * max(support.belief, 0.3))
         if arrow is not None:
             add(f"support {number}", arrow, look)

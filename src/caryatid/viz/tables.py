@@ -48,7 +48,7 @@ def _object_row(item: SceneObject, graph: SupportGraph) -> dict[str, str | Entry
     surface, stability = item.role == "support_surface", graph.stability.get(item.id)
     faces = ("−x", "+x", "−y", "+y", "−z", "+z")
     unseen = " ".join(face for face, seen in zip(faces, item.seen, strict=True) if not seen)
-    supporters = ", ".join(s.supporter + "?" * (not s.certain) for s in graph.supporters(item.id))
+    supporters = ", ".join(s.supporter + "?" * s.doubtful for s in graph.supporters(item.id))
     verdict, ratio, overhang = "–" if surface else "not tested", "–", "–"
     if stability is not None:
         found = ["small area"] * stability.small_area + ["tips"] * stability.tips
@@ -81,7 +81,7 @@ def support_table(graph: SupportGraph) -> Table:
             Entry(s.supporter, colour[s.supporter]),
             Entry(s.supported, colour[s.supported]),
             s.kind,
-            Entry(f"{s.belief:.2f}{'' if s.certain else ', uncertain'}", doubt=not s.certain),
+            Entry(f"{s.belief:.2f}{', doubtful' * s.doubtful}", doubt=s.doubtful),
             f"{s.occurrences} of {s.opportunities}",
             s.why,
         )
@@ -134,25 +134,20 @@ def count_of(number: int, name: str) -> str:
 
 def census(graph: SupportGraph) -> str:
     """Count the objects and supports of a graph."""
-    objects, uncertain = sum(o.role == "object" for o in graph.objects), uncertain_supports(graph)
+    objects = sum(o.role == "object" for o in graph.objects)
+    doubtful = sum(s.doubtful for s in graph.supports)
     text = f"{count_of(objects, 'object')}, {count_of(len(graph.supports), 'support')}"
-    return f"{text}, {uncertain} of them uncertain" if uncertain else text
-
-
-def uncertain_supports(graph: SupportGraph) -> int:
-    """Number of uncertain supports."""
-    return sum(not s.certain for s in graph.supports)
+    return f"{text}, {doubtful} of them doubtful" if doubtful else text
 
 
 def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
-    """List uncertain supports and objects with the reason and a view that would help, most uncertain first.
+    """List doubtful supports and objects with the reason and a view that would help, most doubtful first.
 
-    A support is doubtful if its probability is below 0.95; an object if it has no known supporter, or its
-    shape fits poorly or is implausible.
+    An object is doubtful if it has no known supporter, or its shape fits poorly or is implausible.
     """
     found = []
     for s in sorted(graph.supports, key=lambda s: abs(s.belief - 0.5)):
-        if not s.certain or s.belief < 0.95:
+        if s.doubtful:
             lead = f"{s.supporter} → {s.supported}, probability {s.belief:.2f}"
             found.append((lead, f"{s.why.rstrip('.')}. {_settled_by(graph, s.supporter, s.supported)}"))
     for item in graph.objects:
@@ -202,13 +197,12 @@ def changes(before: SupportGraph | None, after: SupportGraph) -> list[str]:
 
 
 def _supported(graph: SupportGraph) -> dict[str, str]:
-    """Shape and supporters of each object by id; uncertain supporters with a question mark."""
+    """Shape and supporters of each object by id; doubtful supporters with a question mark."""
     texts = {}
     for item in graph.objects:
         supporters = sorted(graph.supporters(item.id), key=lambda s: s.supporter)
         names = [
-            ("the table" if graph[s.supporter].role == "support_surface" else s.supporter)
-            + "?" * (not s.certain)
+            ("the table" if graph[s.supporter].role == "support_surface" else s.supporter) + "?" * s.doubtful
             for s in supporters
         ]
         if item.role == "object":
