@@ -158,7 +158,7 @@ class TestSolve:
         with pytest.raises(PlanningError, match=says):
             arm(reachable).move_to(transforms.look_at(eye, TOP))
 
-    def test_a_base_that_is_no_pose_is_refused(self):
+    def test_a_base_must_be_a_pose(self):
         with pytest.raises(InputError, match="T_world_base"):
             arm(T_world_base=2.0 * BASE)
 

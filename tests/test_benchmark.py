@@ -90,7 +90,7 @@ def test_every_suite_is_made_of_valid_episodes_and_can_be_changed(name):
     assert {config.noise.translation for config in configs} == {0.02}
 
 
-def test_planners_take_the_place_of_the_methods_and_an_option_is_no_setting():
+def test_planners_replace_the_methods_and_options_are_not_settings():
     suite = replace(SUITES["smoke"], scenes=("tower",))
     changed = change_suite(suite, planners=["random", "paper", "random"])
     assert [(m.method, m.episode.planner, m.episode.fusion) for m in changed.members()] == [
@@ -195,7 +195,7 @@ def test_everything_that_decides_an_episode_is_in_its_key(other):
     assert here.key("code") == there.key("code")
 
 
-def test_what_is_no_result_of_this_code_is_refused_and_left_as_it_is(tmp_path):
+def test_results_of_other_code_are_refused_and_kept(tmp_path):
     path = tmp_path / RESULTS
     with pytest.raises(InputError, match="the file is missing; run a suite first"):
         ResultStore(path)
@@ -311,7 +311,7 @@ def test_an_interval_covers_the_mean_as_often_as_it_says():
 
 
 @pytest.mark.slow
-def test_the_command_writes_tables_figures_and_pages_of_what_there_is(tmp_path, capsys):
+def test_the_command_writes_tables_figures_and_pages_of_finished_episodes(tmp_path, capsys):
     out = tmp_path / "bench"
     fill(out / RESULTS)
     command = ("benchmark", "--out", out, "--docs", tmp_path / "page.md", "--reference", "support", "--json")

@@ -137,7 +137,7 @@ def test_what_the_robot_does_is_known_without_a_look(scene):
     assert kinds(scene) == [("removed", "o4"), ("moved", "o5"), ("added", put)]
 
 
-def test_what_the_robot_said_holds_when_it_looks_again(scene, state):
+def test_changes_that_the_robot_reported_hold_when_it_looks_again(scene, state):
     scene.removed("o4")
     scene.moved("o5", ASIDE)
     said = scene.graph

@@ -38,7 +38,7 @@ def differences(colours, vision):
 
 
 @pytest.mark.parametrize("vision", VISIONS)
-def test_colours_are_told_apart_or_have_other_stripes(vision):
+def test_colours_are_distinguishable_or_have_other_stripes(vision):
     """ΔE ≥ 30 between objects numbered one after the other, ≥ 16 between any two with the same stripes."""
     labels = range(1, len(PALETTE) + 1)
     apart = differences([object_colour(k) for k in labels], vision)

@@ -124,7 +124,7 @@ def test_one_shape_stays_one_whatever_the_noise(shape, sigma):
     assert divided(points, normals) is None
 
 
-def test_an_object_that_is_no_primitive_is_not_cut_into_ones():
+def test_an_object_unlike_primitives_is_not_cut_into_primitives():
     rng = np.random.default_rng(0)
     azimuth, height = rng.uniform(-np.pi, np.pi, 4000), rng.uniform(0.0, 0.05, 4000)
     radius = 0.03 + height

@@ -220,7 +220,9 @@ def test_too_many_objects_are_refused_before_they_are_read(tmp_path, graph, caps
         (["--out", "folder.urdf"], "is a directory"),
     ],
 )
-def test_a_file_that_is_no_export_is_never_touched(tmp_path, kept_run, monkeypatch, capsys, arguments, said):
+def test_a_file_of_another_kind_is_never_overwritten(
+    tmp_path, kept_run, monkeypatch, capsys, arguments, said
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "graph.json").write_text("mine")
     (tmp_path / "folder.urdf").mkdir()
@@ -232,7 +234,7 @@ def test_a_file_that_is_no_export_is_never_touched(tmp_path, kept_run, monkeypat
     assert {p.name for p in tmp_path.iterdir()} == {"graph.json", "folder.urdf"}
 
 
-def test_what_cannot_be_exported_is_said(tmp_path, graph, capsys):
+def test_an_impossible_export_ends_in_one_line(tmp_path, graph, capsys):
     assert run_command("export", tmp_path / "no-run", "--out", tmp_path / "s.xml") == 1
     assert "no such folder" in capsys.readouterr().err
     assert run_command("export", tmp_path, "--format", "step", "--out", tmp_path / "s.step") == 2

@@ -115,7 +115,7 @@ def test_that_points_come_in_rows_does_not_show(columns):
         np.testing.assert_allclose(np.sort(boxes[0].shape.extents)[1:], (0.1, 0.12), atol=0.002)
 
 
-def test_what_is_no_single_shape_is_called_a_poor_fit():
+def test_points_of_two_shapes_are_a_poor_fit():
     rng = np.random.default_rng(0)
     bars = [box((0.0, 0.0, 0.0), (0.2, 0.02, 0.02)), box((0.09, 0.09, 0.06), (0.02, 0.2, 0.02))]
     parts = [surface_points(b, rng, sigma=0.001) for b in bars]
@@ -125,7 +125,7 @@ def test_what_is_no_single_shape_is_called_a_poor_fit():
 
 
 @pytest.mark.parametrize("count", [0, 3, CONFIG.min_points - 1])
-def test_too_few_points_are_a_failure_that_says_so(count):
+def test_too_few_points_are_a_clear_failure(count):
     points, normals = surface_points(SHAPES[0], np.random.default_rng(0))
     result = fit(points[:count], normals[:count], config=CONFIG, rng=np.random.default_rng(0))
     assert isinstance(result, FitFailure)

@@ -158,7 +158,7 @@ def test_broken_json_is_refused_in_one_line(tmp_path, content, said):
         read_graph(path)
 
 
-def test_what_is_no_json_is_not_written():
+def test_values_that_json_cannot_hold_are_not_written():
     with pytest.raises(ValueError, match="JSON"):
         json_text({"a": float("nan")})
 

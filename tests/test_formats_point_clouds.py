@@ -213,7 +213,7 @@ def test_the_vertices_of_a_mesh_are_a_cloud(tmp_path):
         b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float a\nend_header\n1\n",
     ],
 )
-def test_what_is_no_ply_is_refused(tmp_path, content):
+def test_files_other_than_ply_are_refused(tmp_path, content):
     path = tmp_path / "a.ply"
     path.write_bytes(content)
     refused(path, "a.ply")

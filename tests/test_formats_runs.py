@@ -141,7 +141,7 @@ def test_a_run_is_not_replaced_where_it_holds_what_no_run_wrote(tmp_path):
     assert read_run(tmp_path / "RUN").record["seed"] == 1
 
 
-def test_a_run_that_does_not_list_its_files_is_not_replaced_and_the_way_out_is_said(tmp_path):
+def test_a_run_that_does_not_list_its_files_is_kept_and_the_error_names_a_remedy(tmp_path):
     write_run(tmp_path / "RUN", views=1, seed=1)
     path = tmp_path / "RUN/run.json"
     path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "files"}))
@@ -162,7 +162,7 @@ def test_what_a_killed_process_left_is_recovered_or_removed(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["run.json", "thesis.tex"])
-def test_what_is_no_run_is_never_touched(tmp_path, name):
+def test_a_folder_without_a_run_is_never_touched(tmp_path, name):
     folder = tmp_path / "thesis"
     folder.mkdir()
     (folder / name).write_text('{"format": "something else"}')
@@ -200,7 +200,9 @@ def test_files_and_empty_folders_in_the_way(tmp_path):
         (errno.EIO, "cannot be written", "run.json"),
     ],
 )
-def test_a_disk_that_refuses_is_said_clearly_and_nothing_is_left(tmp_path, monkeypatch, code, said, name):
+def test_a_full_or_read_only_disk_is_a_clear_error_and_nothing_is_left(
+    tmp_path, monkeypatch, code, said, name
+):
     write = Path.write_bytes
 
     def refuse(path, data):

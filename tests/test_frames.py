@@ -65,7 +65,7 @@ def test_poses_may_come_in_any_order_and_the_last_of_a_time_counts():
 
 
 @pytest.mark.parametrize("late", [-1, SECOND + 1, 3 * SECOND])
-def test_outside_what_was_said_and_across_a_gap_nothing_is_made_up(late):
+def test_no_pose_is_invented_outside_the_messages_or_across_a_gap(late):
     rng = np.random.default_rng(1)
     links = [("map", "eye", NOW + k * SECOND, random_motion(rng)) for k in (0, 1)]
     assert tree_with(*links).between("map", "eye", NOW + late) is None

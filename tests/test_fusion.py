@@ -198,7 +198,7 @@ def test_an_edge_is_certain_where_a_view_was_certain_of_it():
     assert not fused_of(FULL, unsure, config=BOTH).support("o1", "o2").certain
 
 
-def test_what_was_said_of_an_object_taken_for_another_counts_for_that():
+def test_edges_of_an_object_taken_for_another_count_for_the_other():
     twice = graph(("o0", "o1"), ("o1", "o2"), ("o0", "o3"), ("o3", "o1"), shapes={1: CRATE, 2: CAN, 3: CRATE})
     views = [graph(("o3", "o2"), shapes={2: CAN, 3: CRATE}), twice]
     fused = fused_graph(tuple(renamed(view, {"o3": "o1"}) for view in views), BOTH)

@@ -122,7 +122,7 @@ def plain_bag(tmp_path, views, depth=None, colour=None, **camera):
     ("encoding", "big", "padding"),
     [("16UC1", False, 0), ("mono16", True, 6), ("32FC1", False, 8), ("32FC1", True, 0)],
 )
-def test_raw_depth_without_what_is_no_reading(tmp_path, views, encoding, big, padding):
+def test_raw_depth_omits_invalid_readings(tmp_path, views, encoding, big, padding):
     pixels = views[0].depth.astype(np.float32)
     if encoding == "32FC1":
         pixels[:2], pixels[2:4], pixels[4:6], pixels[6:8] = np.nan, np.inf, -1.0, 30.0
@@ -178,7 +178,7 @@ def test_colour(tmp_path, views, pack, encoding):
     assert np.abs(view.rgb.astype(int) - rgb).mean() < (3.0 if encoding == "jpeg" else 1e-9)
 
 
-def test_a_lens_that_distorts_is_told_of(tmp_path, views, capsys):
+def test_lens_distortion_is_reported(tmp_path, views, capsys):
     imported(tmp_path, plain_bag(tmp_path, views[:1], D=(0.1, 0.0, 0.0, 0.0, 0.0)), *TOPICS)
     assert "the lens has distortion" in capsys.readouterr().err
 
@@ -238,7 +238,7 @@ def test_dark_blurred_and_equal_frames_are_counted(tmp_path, views, capsys):
         ((*TOPICS, "--tf", WORLD, "--set", "recording.pose_gap=0.01"), "3 no pose; record poses"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_the_bag_is_said(tmp_path, views, unfit, options, said):
+def test_options_that_do_not_fit_the_bag_are_refused(tmp_path, views, unfit, options, said):
     unfit(bag_of(tmp_path, views), *options, says=said)
 
 

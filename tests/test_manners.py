@@ -98,7 +98,7 @@ def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, 
         ("explore tower --planner suport", "Did you mean support?"),
     ],
 )
-def test_a_usage_error_says_what_would_do_and_is_no_wall_of_text(words, said, capsys, monkeypatch):
+def test_a_usage_error_is_short_and_names_the_remedy(words, said, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     assert run_command(*words.split()) == 2
     captured = capsys.readouterr()
@@ -107,7 +107,7 @@ def test_a_usage_error_says_what_would_do_and_is_no_wall_of_text(words, said, ca
     assert len(captured.err.splitlines()) < 20
 
 
-def test_the_version_is_told(capsys):
+def test_version_prints_the_version(capsys):
     assert run_command("--version") == 0
     assert capsys.readouterr().out == f"caryatid {__version__}\n"
 
@@ -286,7 +286,7 @@ COLOUR = re.compile(r"\x1b\[(?:\d+;)*[349]\d")
 
 
 @pytest.mark.parametrize("words", ["explore nowhere --out", "explore tower --fusion k --out", "juggle"])
-def test_errors_are_coloured_for_a_person_who_has_not_said_no(words, said_on, tmp_path):
+def test_errors_are_coloured_on_a_terminal_unless_no_color_is_set(words, said_on, tmp_path):
     spelled = [*words.split(), *([tmp_path / "run"] if words.endswith("--out") else [])]
     assert COLOUR.search(said_on(spelled, out=True, err=True)[1]) or "nowhere" in words
     for quiet in ({"NO_COLOR": "1"}, {"TERM": "dumb"}):
@@ -327,7 +327,7 @@ def test_an_error_crosses_processes_as_it_is(error):
     assert (vars(copy), str(copy)) == (vars(error), str(error))
 
 
-def test_what_failed_is_said_in_one_line():
+def test_a_failure_is_one_line():
     assert in_one_line(InputError("a.xml", "is\nbroken")) == "a.xml: is broken"
     assert in_one_line(FileNotFoundError(2, "No such file", "a.xml")) == "a.xml: no such file"
     assert "ZeroDivisionError" in in_one_line(ZeroDivisionError("by zero"))

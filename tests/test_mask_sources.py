@@ -168,7 +168,7 @@ def with_arm(tmp_path_factory):
     return folder
 
 
-def test_the_robots_own_arm_is_no_object(with_arm, tmp_path, capsys):
+def test_the_robots_own_arm_is_not_an_object(with_arm, tmp_path, capsys):
     def objects(recording, *options):
         out = ("--no-report", "--quiet", "--out", tmp_path / "run")
         assert run_command("extract", with_arm / recording, *options, *out) == 0

@@ -126,7 +126,7 @@ def test_names_from_outside_are_escaped(scene, steps, views):
         assert "alert(1)" in words(html), type(thing)
 
 
-def test_facts_are_told(shown, scene, steps):
+def test_the_cell_shows_the_facts(shown, scene, steps):
     said = {
         "scene": "3 views",
         "graph": "2 objects, 2 supports",

@@ -73,7 +73,7 @@ def test_the_sdist_holds_tests_docs_and_what_the_tests_read(built):
     assert not any(NOT_SOURCE & set(name.split("/")) or name.endswith((".nbi", ".nbc")) for name in names)
 
 
-def test_what_an_index_is_told(built):
+def test_metadata_for_package_indices(built):
     (path,) = (name for name in built[0].namelist() if name.endswith(".dist-info/METADATA"))
     told = Parser().parsestr(built[0].read(path).decode())
     assert told["Version"] == caryatid.__version__
@@ -185,7 +185,7 @@ WORDS = {
 
 
 @pytest.mark.parametrize("extra", WORDS)
-def test_where_an_extra_is_missing_its_name_is_told(tmp_path, scene_file, views, extra):
+def test_a_missing_extra_is_named(tmp_path, scene_file, views, extra):
     if extra == "ros":
         write_bag(tmp_path / "pour.bag", views)
     run = tmp_path / "run"

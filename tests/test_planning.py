@@ -354,7 +354,7 @@ class TestSaliency:
         hidden = plan("attention", [self.LONE, self.WALL], self.HELD, propagation=False, inhibition=0.0)
         assert hidden.candidate_saliency.min() == -1.0, "a hidden point still repels"
 
-    def test_a_view_no_point_reaches_is_not_said_to_be_about_one(self):
+    def test_a_view_that_no_point_reaches_names_none_as_its_reason(self):
         """A relation found in all views is worth nothing with λ_s = ½: the robot stays where it is."""
         settings = {"saliency_weight": 0.5, "inhibition": 0.0, "path_cost": "angle", "propagation": False}
         alone = plan("attention", [CUBE], (Support("o0", "o1"),), **settings)

@@ -236,7 +236,7 @@ def test_the_pdf_says_what_the_page_says_and_has_the_same_bytes_each_time(report
         assert said in text, said
 
 
-def test_charts_need_several_views_or_scores_and_changes_are_said(make_step):
+def test_charts_need_several_views_or_scores_and_changes_are_listed(make_step):
     graph = make_graph()
     fewer = replace(graph, objects=graph.objects[:3], supports=graph.supports[:2])
     steps, scores = [make_step(0), replace(make_step(1), graph=fewer)], [good(0.5), good(0.9)]
@@ -285,7 +285,7 @@ def test_any_step_is_drawn(make_step):
     assert render_pdf(make_report("t", [nothing]))
 
 
-def test_sizes_stability_and_unseen_sides_are_said():
+def test_tables_give_sizes_stability_and_unseen_sides():
     graph = make_graph()
     seen = (True, False, True, True, False, True)
     objects = (graph.objects[0], replace(graph.objects[1], seen=seen), *graph.objects[2:])
@@ -343,7 +343,7 @@ def test_the_chosen_view_and_the_points_of_interest_are_on_the_sphere(make_step)
     assert picture_svg(draw_sphere(replace(step, candidates=few))) != svg
 
 
-def test_doubt_is_told_in_the_graph_without_colour():
+def test_doubt_shows_in_the_graph_without_colour():
     graph = make_graph()
     svg = picture_svg(draw_graph(graph))
     dashed = re.findall(r'<g class="edge (\w+ \w+) doubtful">.*?</g>', svg, re.DOTALL)
@@ -546,7 +546,7 @@ def test_the_page_answers_on_the_first_screen_and_is_short_offline_and_accessibl
     assert all(url.startswith(("file:", "data:", "blob:", "about:")) for url in asked)
 
 
-def test_a_browser_without_3d_says_so_in_place_of_the_shapes(browser):
+def test_a_browser_without_3d_shows_a_message_in_place_of_the_shapes(browser):
     page = browser.new_page()
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.goto("about:blank")

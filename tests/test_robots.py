@@ -53,7 +53,7 @@ def pose(azimuth: float, elevation: float) -> np.ndarray:
 
 
 class TestFloorGrid:
-    def test_what_lies_flat_or_hangs_high_is_no_obstacle(self):
+    def test_flat_or_high_things_are_not_obstacles(self):
         flat, high = box((0.0, 0.0, 0.005), (1.0, 1.0, 0.005)), box((0.0, 0.0, 3.0), (1.0, 1.0, 0.5))
         assert floor(flat, high).free.all()
 
@@ -259,7 +259,7 @@ def test_a_robot_of_another_package_is_found_by_its_entry_point(surroundings, mo
         ("arm:no-such.npz", r"no-such\.npz: the file is missing"),
     ],
 )
-def test_what_cannot_be_found_is_said(name, message):
+def test_missing_robots_are_reported(name, message):
     with pytest.raises(InputError, match=message):
         find_robot(name)
 

@@ -263,7 +263,7 @@ def test_a_cloud_is_taken_in_like_a_view():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_an_object_taken_away_vanishes_once_views_look_through_where_it_was(method):
+def test_a_removed_object_vanishes_once_views_look_through_its_place(method):
     crate, can = box((0.0, -0.15, 0.8), (0.1, 0.1, 0.1)), box((0.0, 0.15, 0.82), (0.08, 0.08, 0.14))
     both = [(s.T_world_object[:3, 3], s.extents) for s in (crate, can)]
     scene = Scene(config_for(method), segmentation="labels")

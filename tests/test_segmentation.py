@@ -68,7 +68,7 @@ def test_the_table_is_found_not_the_floor(sigma):
 
 
 @pytest.mark.parametrize("up", [UP, None])
-def test_no_surface_is_an_error_that_says_so(up):
+def test_a_view_without_a_surface_is_a_clear_error(up):
     rng = np.random.default_rng(0)
     points, normals = rng.uniform(-1, 1, size=(3000, 3)), transforms.unit(rng.normal(size=(3000, 3)))
     config = SurfaceConfig(min_points=400)
@@ -79,7 +79,7 @@ def test_no_surface_is_an_error_that_says_so(up):
 
 
 @pytest.mark.parametrize(("degrees", "found"), [(8.0, True), (12.0, False)])
-def test_a_support_surface_leans_by_ten_degrees_at_the_most(degrees, found):
+def test_a_support_surface_leans_by_at_most_ten_degrees(degrees, found):
     R = transforms.rotation_from_vector((np.radians(degrees), 0.0, 0.0))
     grid = np.stack(np.meshgrid(np.arange(-0.3, 0.3, 0.01), np.arange(-0.4, 0.4, 0.01), [0.0]), axis=-1)
     plane = grid.reshape(-1, 3) @ R.T, np.tile(R[:, 2], (grid.size // 3, 1))
@@ -312,7 +312,7 @@ def test_the_walls_of_a_bin_are_no_object(azimuth, elevation, half_table):
 
 
 @pytest.mark.parametrize("elevation", [20.0, 40.0])
-def test_the_wall_behind_a_table_is_no_object_nor_part_of_what_stands_before_it(elevation):
+def test_the_wall_behind_a_table_is_neither_an_object_nor_part_of_one(elevation):
     wall = (np.array([-0.31, 0.0, 0.75]), np.array([0.02, 3.0, 1.5]))
     close = (np.array([-0.26, 0.1, TABLE + 0.05]), np.array([0.08, 0.1, 0.1]))
     view = table_scene(from_the_side(0.0, elevation), [*CONTENTS, close, wall], sigma=0.001)
@@ -339,7 +339,7 @@ def test_a_bowl_is_one_object_around_the_can_that_parts_its_inside(elevation, ti
     assert found(labels, view.labels) == (2, 2, 2)
 
 
-def test_a_ramp_of_readings_beside_an_edge_is_no_object():
+def test_a_ramp_of_readings_beside_an_edge_is_not_an_object():
     """Ten pixels beside the box mix its top and the table 30 cm below it."""
     tall = (np.array([0.0, 0.0, TABLE + 0.15]), np.array([0.15, 0.2, 0.3]))
     view = table_scene(from_the_side(0.0, elevation=75.0, distance=1.4), [tall], sigma=0.001)
@@ -349,7 +349,7 @@ def test_a_ramp_of_readings_beside_an_edge_is_no_object():
     assert found(parts(replace(view, depth=mixed.astype(np.float32))), view.labels) == (1, 1, 1)
 
 
-def test_what_stands_beside_the_table_is_no_object_on_it():
+def test_a_thing_beside_the_table_is_not_an_object_on_it():
     beside = (np.array([0.38, 0.0, 0.45]), np.array([0.12, 0.3, 0.9]))
     view = table_scene(from_the_side(azimuth=180.0), [*STACK, beside], sigma=0.001)
     assert found(parts(view), np.where(view.labels == 3, 0, view.labels)) == (2, 2, 2)

@@ -128,7 +128,7 @@ def test_a_session_over_http_is_the_session(client, views):
     assert client.delete("/sessions/a/views/last").status_code == 409
 
 
-def test_a_view_without_a_table_is_kept_and_the_client_told(client, views):
+def test_a_view_without_a_table_is_kept_and_reported_to_the_client(client, views):
     wall = body(wall_of(views[0]), number=0)
     first, again = (client.post("/sessions/a/views", json=wall) for _ in range(2))
     assert first.json()["warnings"][0].endswith("this view is kept until a later one shows the table top")
@@ -224,7 +224,7 @@ def test_a_service_that_is_full_takes_nothing_new(client, limit, views):
         assert added.status_code == (503 if "min_free" in limit else 201)
 
 
-def test_what_is_not_there_is_said(client):
+def test_missing_things_answer_404(client):
     for method, page in (("GET", ""), ("GET", "/graph"), ("GET", "/next"), ("DELETE", "/views/last")):
         answer = client.request(method, f"/sessions/no{page}")
         assert answer.status_code == 404
@@ -318,7 +318,7 @@ def test_this_machine_needs_no_token_and_every_other_address_demands_one(tmp_pat
     assert not (tmp_path / "s").exists()
 
 
-def test_a_port_that_is_taken_is_said_in_one_line(tmp_path, capsys):
+def test_a_port_in_use_ends_in_one_line(tmp_path, capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert run_command("serve", tmp_path / "s", "--port", port) == 1

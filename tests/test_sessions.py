@@ -370,7 +370,7 @@ def test_a_second_writer_is_refused_and_a_reader_is_not(begun, views):
         assert session.views == 3
 
 
-def test_a_lock_that_cannot_be_had_is_said(begun):
+def test_a_lock_that_cannot_be_taken_is_an_error(begun):
     (begun / "lock").unlink()
     (begun / "lock").mkdir()
     with pytest.raises(InputError, match="lock"):
@@ -489,7 +489,7 @@ def test_labels_come_with_all_views_or_with_none(folder, views):
             session.add(views[1])
 
 
-def test_a_pose_that_is_a_little_off_is_no_jump(begun, views):
+def test_a_pose_that_is_slightly_off_is_not_a_jump(begun, views):
     turn = transforms.rotation_from_vector((0.0, 0.0, 0.05))
     T = views[2].pose @ transforms.rigid(turn, (0.02, -0.02, 0.03))
     with Session.open(begun) as session:
@@ -514,7 +514,7 @@ def test_a_view_comes_back_bit_by_bit(tmp_path, views):
 # Folders
 
 
-def test_a_folder_that_is_no_session_is_said(tmp_path):
+def test_a_folder_without_a_session_is_an_error(tmp_path):
     for path in (tmp_path, tmp_path / "nothing"):
         with pytest.raises(InputError, match="not a session; create one"):
             Session.open(path)

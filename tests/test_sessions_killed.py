@@ -48,7 +48,7 @@ def test_many_clients_at_once_lose_nothing(tmp_path, around):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_service_that_is_told_to_stop_finishes_the_view_in_hand(tmp_path, around, number):
+def test_a_service_asked_to_stop_finishes_the_current_view(tmp_path, around, number):
     process = start(["serve", tmp_path / "s", "--port", 0, "--json"], tmp_path / "said")
     robot = RobotClient(address_of(tmp_path / "said"))
     robot.begin("table", segmentation="labels")

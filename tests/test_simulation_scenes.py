@@ -99,7 +99,7 @@ def test_a_scene_at_rest_keeps_its_poses_and_one_in_the_air_falls():
     np.testing.assert_array_equal(falling.data.qvel, 0.0)
 
 
-def test_what_never_rests_is_said_to_move():
+def test_a_scene_that_never_rests_is_reported_as_moving():
     slide = CUBE.replace("<geom", '<geom friction="0 0 0"')
     spec = mujoco.MjSpec.from_string(mjcf(TABLE.replace("<geom", '<geom friction="0 0 0"') + slide))
     spec.option.gravity = [0.3, 0.0, -9.81]

@@ -74,7 +74,7 @@ def declared(package):
 
 
 @pytest.mark.parametrize("package", [caryatid, caryatid.io])
-def test_names_come_from_where_type_checkers_are_told(package):
+def test_names_come_from_where_type_checkers_look(package):
     names = declared(package)
     assert names
     assert set(names) <= set(package.__all__) <= set(dir(package))

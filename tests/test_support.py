@@ -575,7 +575,7 @@ class TestReconcile:
             assert 1000.0 * (bottom - lower) == pytest.approx(down * 25.0 / 26.0, abs=0.05)
             assert upper == pytest.approx(bottom + 0.05)
 
-    def test_what_uncertainty_cannot_explain_is_left_and_said(self):
+    def test_what_uncertainty_cannot_explain_stays_and_is_reported(self):
         first, second = (thing(k, (x, 0, 0.05), unsure(0.0005)) for k, x in ((1, 0.0), (2, 0.06)))
         for before, after in zip(
             [first, second], reconcile([SURFACE, first, second], PLAUSIBLE)[1:], strict=True

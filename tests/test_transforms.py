@@ -43,7 +43,7 @@ def broken(change):
         (np.zeros((4, 4)), "last row"),
     ],
 )
-def test_what_is_no_rigid_transform_is_refused_by_name_and_reason(T, reason):
+def test_other_matrices_than_rigid_transforms_are_refused_by_name_and_reason(T, reason):
     with pytest.raises(InputError, match=reason) as caught:
         transforms.as_rigid(T, "frame 7")
     assert str(caught.value).startswith("frame 7: ")

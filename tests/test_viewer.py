@@ -199,7 +199,7 @@ def test_what_is_kept_of_a_step_is_small(step):
     assert field_of_view[0] == pytest.approx(field_of_view[1], 0.02)
 
 
-def test_what_is_said_of_an_object(step, settings):
+def test_the_panel_describes_an_object(step, settings):
     graph, config = step.graph, settings.support
     text = describe_object(graph, "o1", config)
     for part in ("box", "o0 → o1", "o1 → o2", "Without o1", "o2 falls with probability 1.00:"):
@@ -561,7 +561,7 @@ def test_a_view_is_chosen_by_hand(page, tab):
 
 
 @pytest.mark.slow
-def test_everything_is_taken_away(page, tab):
+def test_everything_is_removed(page, tab):
     page.describe("o2")
     tab.press("clear")
     tab.wait_for_text("finished: no objects are left; nothing disturbed")
