@@ -299,8 +299,7 @@ class SupportConfig:
     reach: NotNegative = 0.012
     """Maximum gap of two shapes that may touch, or that an object tips across [m]; 2.5σ of the gap."""
     max_tilt: Angle = 75.0
-    """Maximum tilt of the separating plane of a support from below [deg]; from there on, objects lean, and
-    friction does not stop a fall."""
+    """Maximum tilt of the separating plane of a support from below [deg]; from there on, objects lean."""
     patch_depth: NotNegative = 0.003
     """Surfaces within this distance of the first contact also touch [m]; noise of one reading at 1.5 m."""
     min_area_ratio: Share = 0.1

@@ -24,13 +24,12 @@ from caryatid.support.stability import contact_area
 
 _GRAVITY = 9.81
 """[m/s²]."""
-_SOFTNESS = 5e-3
+_SOFTNESS = 1e-3
 """Share of the load by which a contact yields [1]: undetermined forces then spread evenly."""
-_SLIP = 10.0
+_SLIP = 30.0
 """How much more friction yields than pressure [1]: it carries what pressure cannot. Nothing presses
-neighbours together sideways, and side by side they settle without holding each other up."""
-_SMOOTH = 1e-4
-"""Coefficient of almost no friction [1]; MuJoCo needs some."""
+neighbours together sideways, and side by side they settle without holding each other up. What friction
+holds alone yields by 3 % of its weight, and still counts as at rest."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -217,10 +216,9 @@ class Equilibrium:
     def draws(self, rng: np.random.Generator) -> Iterator[Draw]:
         """Draw scenes: first the estimated one, then others as likely.
 
-        Shapes move, turn and grow by their fits' uncertainty. Each contact that weight can press shut, its
-        normal within the friction cone around the vertical, is closed with the probability that its gap
-        implies; before that, no gap is as likely as any gap up to `reach`. Closed gaps correct all shapes, as
-        in `reconcile`. Gaps into which objects fall or tip in the first draw are closed in all.
+        Shapes move, turn and grow by their fits' uncertainty. Each contact is closed with the probability
+        that its gap implies; before that, no gap is as likely as any gap up to `reach`. Closed gaps correct
+        all shapes, as in `reconcile`. Gaps into which objects fall or tip in the first draw close in all.
         """
         config, count = self._config, len(self.contacts)
         sigma = np.array([deviations(o) for o in self._objects]).reshape(-1, 9)
@@ -232,9 +230,6 @@ class Equilibrium:
         scatter = np.einsum("kpv,kpv->k", rows**2, variance[self._pairs]) + config.touch**2
         odds = np.exp(-(np.maximum(found, 0.0) ** 2) / (2.0 * scatter)) * config.reach
         shut = odds / (odds + np.sqrt(2.0 * np.pi * scatter))
-        upright = np.array([abs(c.normal_world[2]) for c in self.contacts])
-        shut *= upright >= np.cos(np.arctan(np.mean(config.friction)))
-        walls = upright < np.cos(np.radians(config.max_tilt))
         far, fallen = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         for number in range(config.draws):
             first = number == 0
@@ -258,9 +253,7 @@ class Equilibrium:
                 densities,
             )
             if first:
-                # A wall does not hold an object that falls along it.
-                falling = replace(draw, frictions=np.where(walls, _SMOOTH, draw.frictions))
-                far, fallen = self._landings(falling)
+                far, fallen = self._landings(draw)
                 draw = replace(draw, gaps=np.where(far, np.inf, np.where(fallen, 0.0, draw.gaps)))
             yield draw
 
@@ -293,9 +286,9 @@ class Equilibrium:
         if len(gone):
             data.contact.exclude[:] = gone
             data.contact.dist[:] = np.where(apart, 1.0, draw.gaps)[self._contact]
+            data.contact.friction[:, :2] = draw.frictions[self._contact, None]
             # Open contacts have no friction; otherwise objects sliding along them would push them away.
-            rough = np.where(draw.gaps > 0.0, _SMOOTH, draw.frictions)
-            data.contact.friction[:, :2] = rough[self._contact, None]
+            data.contact.dim[:] = np.where(draw.gaps > 0.0, 1, 3)[self._contact]
         for stage in (
             mujoco.mj_makeConstraint, mujoco.mj_projectConstraint, mujoco.mj_fwdVelocity,
             mujoco.mj_fwdActuation, mujoco.mj_fwdAcceleration, mujoco.mj_fwdConstraint,
@@ -311,7 +304,8 @@ class Equilibrium:
         if len(gone):
             active = np.flatnonzero(~gone & (data.contact.efc_address >= 0))
             frames = data.contact.frame.reshape(-1, 3, 3)[active]
-            forces = data.efc_force[data.contact.efc_address[active, None] + np.arange(3)]
+            rows = data.contact.efc_address[active, None] + np.arange(3)
+            forces = data.efc_force.take(rows, mode="clip") * (np.arange(3) < data.contact.dim[active, None])
             forces_world = np.einsum("ki,kij->kj", forces, frames)
             pressed[self._contact[active[forces[:, 0] > 0.0]]] = True
             a, b = self._pairs[self._contact[active]].T
@@ -344,7 +338,6 @@ class Equilibrium:
         contact = mujoco.MjContact()
         contact.dim, contact.flex, contact.elem, contact.vert = 3, [-1, -1], [-1, -1], [-1, -1]
         contact.includemargin, contact.mu, contact.exclude = 0.0, 0.0, 0
-        contact.friction[:] = _SMOOTH
         # An acceleration of one g closes an open gap as wide as the furthest fall.
         contact.solref[:], contact.solreffriction[:] = (-_GRAVITY / self._fall, -1.0), 0.0
         contact.solimp[:] = (1.0 - _SOFTNESS, 1.0 - _SOFTNESS, 1e-3, 0.5, 2.0)
