@@ -269,7 +269,7 @@ def test_how_good_probabilities_are_by_hand():
     one = [[0.95, True], [0.92, True], [0.42, False], [0.0, True]]
     two = [[0.95, False], [1.0, True], [0.48, False], [0.95, True]] * 2
     rows = table({"a": [("one", [0.5]), ("two", [0.5])]})
-    rows["forecasts"] = [one, two]
+    rows["forecasts"] = [[[p, 1.0, t] for p, t in one], two]  # The first as earlier versions wrote it.
     summary = summarise(rows, reference="a")
     said, true = np.array(one + two).T
     errors = (said - true) ** 2

@@ -229,7 +229,8 @@ def _calibration(episodes: pd.DataFrame) -> Iterator[Statistic]:
 
 def _sums(forecasts: Sequence[Sequence[float]]) -> Array:
     """Number of missing supports; both squared errors of the others, and their sums by bin."""
-    table = np.array(forecasts, dtype=np.float64).reshape(-1, 2)
+    # Results of earlier versions have a number between the two.
+    table = np.array([(p, true) for p, *_, true in forecasts], dtype=np.float64).reshape(-1, 2)
     said, true = table[table[:, 0] > 0.0].T
     bins = np.minimum(BINS * said, BINS - 1).astype(int)
     binned = [np.bincount(bins, of, BINS) for of in (np.ones(len(bins)), said, true)]
