@@ -1,4 +1,4 @@
-"""How the documentation is built: `make docs`."""
+"""Configuration of the documentation, built by `make docs`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ default_role = "code"
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4
-nb_execution_mode = "off"  # notebooks are kept with what they showed when they were run
+nb_execution_mode = "off"  # the committed notebooks contain their outputs
 nb_merge_streams = True
 html_math_renderer = "drawn"
 
@@ -63,14 +63,14 @@ documented = set(
 )
 nitpicky = True
 nitpick_ignore_regex = [
-    ("py:.*", r"(?!caryatid\.).*"),  # other packages' names: nothing is fetched from their sites
+    ("py:.*", r"(?!caryatid\.).*"),  # names of other packages: no inventories are fetched
     ("py:.*", r"caryatid\.(\w+\.)*_\w+"),  # private names, in the annotations of settings
     ("py:.*", rf"({'|'.join(re.escape(m) for m in sorted(modules - documented))})\.\w+"),
 ]
 
-for page in ("benchmark", "benchmark-planners", "benchmark-dismantle"):
-    command = f"caryatid benchmark --out results --docs {page}.md"
-    write_document(*read_results(DOCS / "results" / f"{page}.json.gz"), DOCS / f"{page}.md", command)
+for kept in (DOCS / "results").glob("*.json.gz"):
+    page = kept.name.replace("json.gz", "md")
+    write_document(*read_results(kept), DOCS / page, f"caryatid benchmark --out results --docs {page}")
 
 copy_examples(DOCS.parent / "examples", DOCS / "_build" / "examples")
 sphinx_gallery_conf = {
@@ -106,9 +106,9 @@ html_show_sourcelink = False
 
 
 def adapt(app: object, name: str, source: list[str]) -> None:
-    """Adapt a page, as the repository shows it, to this site.
+    """Adapt a page of the repository to this site.
 
-    Links to programs lead to their pages; what a table of contents would hold, if it were there, is left out.
+    Links to example programs lead to their pages. Entries of a table of contents without a file are removed.
     """
     text = re.sub(r"\]\(\.\./examples/(\w+)\.py\)", r"](gallery/\1.rst)", source[0])
     source[0] = re.sub(
@@ -125,11 +125,11 @@ def leave_settings_out(
     arguments: str | None,
     gives: str | None,
 ) -> tuple[str | None, str | None]:
-    """Let classes of settings stand without their dozens of arguments: a page of their own lists these."""
+    """Omit the dozens of arguments of settings classes; the settings page lists them."""
     return ("", None) if what == "class" and name.startswith("caryatid.config.") else (arguments, gives)
 
 
 def setup(app: object) -> None:
-    """Tell Sphinx of what is done here."""
+    """Register the handlers with Sphinx."""
     app.connect("autodoc-process-signature", leave_settings_out)  # type: ignore[attr-defined]
     app.connect("source-read", adapt)  # type: ignore[attr-defined]

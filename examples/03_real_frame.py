@@ -33,9 +33,9 @@ def main(folder: Path) -> Score | None:
     scene = ct.Scene()
     graph = scene.update(view)
     for o in graph.objects[1:]:
-        holders = " and ".join(s.supporter for s in graph.supporters(o.id)) or "nothing that was seen"
+        supporters = " and ".join(s.supporter for s in graph.supporters(o.id)) or "something unseen"
         size = " × ".join(f"{100 * e:.0f}" for e in o.shape.extents)
-        print(f"  {o.id}: {o.shape.kind} of {size} cm, held by {holders}")
+        print(f"  {o.id}: {o.shape.kind} of {size} cm, supported by {supporters}")
     assert graph.support_surface is not None
 
     if view.labels is None or scene.labels is None or not (folder / "gt.json").is_file():

@@ -25,9 +25,9 @@ class RobotClient:
     """Sessions of a service.
 
     Args:
-        address: Where the service is.
-        token: What it demands, if it does.
-        patience: How long an answer may take, and how long a service that is busy or away is asked again [s].
+        address: Address of the service.
+        token: Token, if the service requires one.
+        patience: Timeout of a request, and of retries while the service is busy or unreachable [s].
     """
 
     def __init__(self, address: str, token: str | None = None, patience: float = 60.0) -> None:
@@ -38,7 +38,7 @@ class RobotClient:
             self.headers["Authorization"] = f"Bearer {token}"
 
     def begin(self, name: str, **options: Any) -> dict[str, Any]:
-        """Create a session; options: segmentation, seed, planner, settings."""
+        """Create a session; options: segmentation, seed, planner, settings, ignore."""
         return self._ask("POST", "/sessions", {"name": name, **options})
 
     def add(
@@ -98,7 +98,7 @@ class RobotClient:
                 if error.code != 503 or time.monotonic() - begun > self.patience:
                     raise RuntimeError(f"{method} {path}: {error.code} {error.read().decode()}") from None
             except (OSError, http.client.HTTPException):
-                # What takes a view back would take another one back; what was moved would move again.
+                # No retry: a second undo removes another view, a second report moves the object again.
                 once = method == "DELETE" or path == "/sessions" or path.endswith("/reports")
                 if once or time.monotonic() - begun > self.patience:
                     raise

@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SOURCE = ROOT / "src/caryatid"
 README = (ROOT / "README.md").read_text()
-GENERATED = {"benchmark.md", "benchmark-planners.md", "benchmark-dismantle.md"}
+GENERATED = {kept.name.replace("json.gz", "md") for kept in DOCS.glob("results/*.json.gz")}
 """Pages that are written when the documentation is built."""
 BUILT = ("_build", "gallery", "notebooks")
 """Folders in docs that hold no pages of this kind."""

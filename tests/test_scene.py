@@ -211,7 +211,7 @@ def test_intrinsics_of_another_resolution_are_warned_of(factor, warned, caplog):
     view = replace(simulated_views("tower")[0], T_world_camera=None)
     with suppress(PerceptionError):
         Scene(segmentation="labels").update(replace(view, K=np.diag([factor, factor, 1.0]) @ view.K))
-    assert ("is K of another resolution?" in caplog.text) == warned
+    assert ("is K for another resolution?" in caplog.text) == warned
 
 
 def test_normals_of_a_cloud_may_have_any_length():

@@ -46,7 +46,7 @@ def format_of(path: Path, wanted: ExportFormat | None = None) -> ExportFormat:
 
 
 def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | None = None) -> None:
-    """Write a scene model to a file, whose name says the format, whole or not at all; an old one is replaced.
+    """Write a scene model in the format of the file's suffix, whole or not at all; replace an existing file.
 
     Raises:
         InputError: The suffix is unknown, there is nothing to export or too much, the format rejects the

@@ -80,7 +80,7 @@ class Support:
         opportunities: How many times both its ends were extracted.
         contact_world: Centre (3,) [m] of the contact patch, or None.
         normal_world: Normal (3,) of the separating plane, from supporter to supported, or None.
-        why: Which test put it there, with figures.
+        why: The test that found it, with figures.
         probability: Probability that it exists [1], or None.
     """
 
@@ -185,8 +185,8 @@ class Stability:
         ratio: Support area ratio r_s in [0, 1], eq. 1.
         overhang: How far [m] the centre of mass projects outside the support polygon; negative inside,
             infinite where nothing supports it.
-        small_area: r_s < r_s,min fired.
-        tips: The centre-of-mass test fired.
+        small_area: Whether r_s is below r_s,min.
+        tips: Whether `overhang` exceeds `support.overhang`; False if `support.stability` is `area`.
     """
 
     ratio: float

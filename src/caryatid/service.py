@@ -254,7 +254,8 @@ class SessionPool:
         self._check_room()
         if len(self.names()) >= self.config.session.max_sessions:
             most = self.config.session.max_sessions
-            raise FullError(f"this service has reached session.max_sessions = {most}")
+            remedy = "delete folders of old sessions, or raise that setting"
+            raise FullError(f"this service has reached session.max_sessions = {most}; {remedy}")
         return self._opened(name, Session.begin(self.folder / name, config, **options))
 
     def session(self, name: str) -> Session:

@@ -224,7 +224,7 @@ def _check_no_run(source: str) -> None:
     """Reject a run folder, unless a built-in scene has its name."""
     if not is_builtin(source) and is_run(Path(source)):
         view, score, order = (f"`caryatid {command} {source}`" for command in ("view", "evaluate", "order"))
-        remedy = f"see it with {view}, score it with {score}, or plan lifts with {order}"
+        remedy = f"view it with {view}, score it with {score}, or plan lifts with {order}"
         raise InputError(source, "is a run, not a scene or recording", remedy)
 
 

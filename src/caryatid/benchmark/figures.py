@@ -62,7 +62,7 @@ def draw_group(group: pd.DataFrame, measure: str, heading: str, reference: str) 
         yield _figure(f"f1 over path {family}", caption, 14, partial(_lines, curves, path, heading))
     if differences := curves_of(group, f"{measure} difference"):
         label = f"{heading} minus that of {reference}"
-        caption = f"{label} in {scenes}, paired: mean and interval. Pale: the interval holds 0."
+        caption = f"{label} in {scenes}, paired: mean and interval. Pale: the interval includes 0."
         plot = partial(_rows, differences, label, zero=True)
         yield _figure(f"{measure} differences {family}", caption, len(differences), plot)
     panels = {view: curves_of(group, f"reliability {view}").get(reference) for view in (1, 2, 3, 5)}

@@ -285,7 +285,7 @@ _ALL = (
     ),
     Suite(
         "ablation-attention",
-        "What the paper leaves open, one setting at a time, for Algorithm 2 read with these settings.",
+        "What the paper leaves open, one setting at a time, for the planner `attention`.",
         _ablation("attention", _ATTENTION),
         DENSE[:16],
     ),

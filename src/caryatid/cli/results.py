@@ -19,7 +19,7 @@ Topic = Annotated[str | None, options.shown("TOPIC")]
 
 @dataclass(frozen=True, kw_only=True)
 class Import(options.Command):
-    """Convert a robot's recording to a scene folder of sharp views from different viewpoints.
+    """Convert a robot's log to a recording: sharp views from different viewpoints, with their poses.
 
     Read bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), or a folder of the
     TUM RGB-D benchmark, which needs no topics. Depth must be registered to the colour image.
@@ -34,7 +34,7 @@ class Import(options.Command):
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """Bag, or TUM RGB-D folder with depth.txt."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Scene folder to write, in the BOP format; must be new or empty."""
+    """Recording to write, a folder in the BOP format; must be new or empty."""
     depth: Topic = None
     """Depth images: 16UC1 or mono16 [mm], 32FC1 [m], or PNG-compressed. If omitted, list all topics."""
     info: Topic = None

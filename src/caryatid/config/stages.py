@@ -71,7 +71,8 @@ class CloudConfig:
     voxel: Positive = 0.005
     """Spacing of an object's points, pooled over views [m]; about the noise of one reading at 1.5 m."""
     depth: Count = 5
-    """Points kept in a voxel that more than twice as many views show [1]; their mean has half the noise."""
+    """Points kept per voxel of an object that more than twice as many views show [1]; their mean has half the
+    noise."""
     neighbours: Count = 16
     """Number of neighbours that define the normal of a point in an unorganised cloud [1]."""
 
@@ -197,7 +198,8 @@ class FitConfig:
     max_points: Count = 800
     """Maximum number of points that score a shape [1]; 1.5 cm apart on the largest objects."""
     search_points: Count = 250
-    """Number of points used by the search, up to twice as many [1]; the best are refined on all points."""
+    """Number of points in the search, or up to twice that [1]; the best hypotheses are refined on all
+    points."""
     min_points: Count = 12
     """Minimum number of points of an object [1]; a box has nine parameters."""
     threshold: Positive = 0.01
@@ -307,8 +309,8 @@ class SupportConfig:
     overhang: NotNegative = 0.003
     """An object tips if its centre of mass is this far outside the support polygon [m]; 1σ of a fit."""
     stability: Literal["area", "balance"] = "balance"
-    """What decides: contact planes and r_s of eq. 1 (`area`, the paper's; all on top of an object with a
-    small support area holds it), or the forces that hold the scene at rest (`balance`)."""
+    """What decides: separating planes and r_s of eq. 1 (`area`, the paper's rules; everything on top of an
+    object with r_s < r_s,min also supports it), or the forces that hold the scene at rest (`balance`)."""
     draws: Count = 12
     """Number of scenes sampled from the fits' uncertainty [1]; a probability near 0.5 is accurate to 0.14."""
     force_share: Share = 0.03
@@ -480,7 +482,7 @@ class SensorConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class NoiseConfig:
-    """Carmine 1.09 depth noise and registration error, method notes section 2."""
+    """Depth noise of a Carmine 1.09, and registration error."""
 
     axial: tuple[NotNegative, NotNegative, NotNegative] = (0.0012, 0.0019, 0.4)
     """(a, b, z0) of σ(z) = a + b·(z − z0)² [m]."""
@@ -500,7 +502,7 @@ class NoiseConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class PhysicsConfig:
-    """Settling a simulated scene and deriving ground-truth support from physics, method notes section 4."""
+    """Simulated scenes at rest, and their ground truth from physics."""
 
     rest_window: Positive = 0.25
     """Time over which motion is measured to decide whether an object is at rest [s]."""
@@ -526,7 +528,7 @@ class PhysicsConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class EvaluationConfig:
-    """Scores against a ground truth, method notes section 5."""
+    """Scores against a ground truth, section V."""
 
     min_iou: Share = 0.5
     """Minimum IoU of volumes or masks for an object to match the ground truth [1]."""
@@ -538,7 +540,7 @@ class EvaluationConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class OracleConfig:
-    """The planner that knows the ground truth, method notes section 6."""
+    """The planner `oracle`, which knows the ground truth."""
 
     candidates: Count = 32
     """Maximum number of views tried, apart from the default planner's [1]; about 20° apart, 0.7 s each."""
@@ -656,7 +658,7 @@ class GripperConfig:
     travel: Positive = 0.1
     """Length of the straight approach, and of the lift along which the gripper touches nothing [m]."""
     seen: Share = 0.95
-    """Minimum share of the space that the gripper approaches through, seen empty [1]; the rest is noise."""
+    """Minimum share of the space along the approach that was seen to be free [1]; the rest is noise."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

@@ -1,4 +1,4 @@
-"""Scores of a support graph and of its probabilities: method notes 5, eqs. 4 and 5 of the paper."""
+"""Scores of a support graph and of its probabilities: section V of the paper, eqs. 4 and 5."""
 
 from __future__ import annotations
 

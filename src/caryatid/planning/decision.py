@@ -32,7 +32,7 @@ class PlanningState:
     Attributes:
         graph: The fused support graph.
         sphere: The view sphere.
-        voxels: Space seen free, occupied, or not at all.
+        voxels: The voxel map: free, occupied and unknown space.
         visited: Unit directions (V, 3) from the centre to the views so far; the last is the current one.
         candidates: The views that can be reached.
         config: Settings of section IV.
@@ -82,8 +82,8 @@ class Decision(Pictured):
         candidate_saliency: s (N,) of every candidate, or None.
         sphere_saliency: s (M,) of every point of the view sphere, for drawing, or None. It may be a function
             that returns the array, because most pictures are never drawn.
-        waypoints: The way there: postures from the robot's own to the one at the view, straight in between.
-            Only the last if the robot gives no more; none without a robot.
+        waypoints: The path to the view: postures, from the current one to the one at the view, connected by
+            straight lines. Only the last if the robot returns no others; empty without a robot.
     """
 
     T_world_camera: Array

@@ -94,7 +94,7 @@ def largest_arc(visited: Array) -> float:
 
 
 def relation_saliency(occurrences: int, views: int, config: ActiveVisionConfig) -> float:
-    """Interest of a relation that was seen in some of the views, eq. 2.
+    """Saliency of a relation that was found in some of the views, eq. 2.
 
     s = λ_s + (1 − λ_s) · cos(2π · #occ / #views) as printed (`paper`), or with π in place of 2π
     (`decreasing`), which falls from 1 for a relation never seen to 2λ_s − 1 for one always seen.

@@ -1,4 +1,4 @@
-"""Automatic segmentation: convex parts on the support surface, merged where a network takes them for one."""
+"""Automatic segmentation: convex segments on the support surface, merged by a network's affinities."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def segment(
     fit_config: FitConfig,
     rng: np.random.Generator,
 ) -> tuple[Labels, Pairs]:
-    """Cut one view into the parts on the support surface.
+    """Cut one view into the segments on the support surface.
 
     Args:
         view: The view, which has a pose.

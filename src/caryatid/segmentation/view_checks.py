@@ -52,7 +52,7 @@ def check_centre(view: View) -> None:
     """Warn if the principal point is a fifth of the image away from its middle, as for another resolution."""
     size, centre = np.array(view.depth.shape[::-1]), view.K[:2, 2]
     if (np.abs(centre - (size - 1) / 2.0) > size / 5.0).any():
-        text = "%s: K has its principal point at (%.0f, %.0f) in %d×%d pixels; is K of another resolution?"
+        text = "%s: K has its principal point at (%.0f, %.0f) in %d×%d pixels; is K for another resolution?"
         log.warning(text, view.name, *centre, *size)
 
 

@@ -214,7 +214,7 @@ class Camera(Protocol):
     """Takes a view from a pose: simulation, recording or hardware."""
 
     def capture(self, T_world_camera: Array) -> View:
-        """Take a view from a requested pose (4, 4); it holds the pose the camera believes in."""
+        """Take a view from a requested pose (4, 4); its own pose is the one that the robot reports."""
         ...
 
 

@@ -39,10 +39,10 @@ def infer(
     """Infer which objects of a scene model support which, and how likely.
 
     An object supports another one that it touches if the forces that hold the scene at rest need it: it
-    carries a share of its weight, or the other one moves without it. The probability is the share of draws
-    of what is not known, such as the gap, in which it does. With `stability` = `area`, the rules of the
-    paper decide instead, and there are no probabilities: from each separating plane the lower object
-    supports the upper one, and all on top of an object with a small support area hold it down.
+    carries a share of its weight, or the other one moves without it. The probability is the share of scenes,
+    sampled from the uncertainty of shapes, friction and weights, in which it does. With `stability` = `area`,
+    the rules of the paper decide instead, and there are no probabilities: at each separating plane, the lower
+    object supports the upper one, and everything on top of an object with a small support area holds it down.
 
     Args:
         objects: Shapes in the world frame; nothing supports the one with role `support_surface`.
@@ -104,7 +104,7 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
         gap = find_gap(graph.objects[a].shape, graph.objects[b].shape)
         return f"{head}: they do not touch, {_gap(gap)}."
     if config.stability == "area":
-        return f"{head}: it is not below it ({_described(contact)})."
+        return f"{head}: {supporter} is not below {supported} ({_described(contact)})."
     share = support_forces(graph.objects, config, np.random.default_rng(0)).shares[a, b]
     return f"{head}: {supported} rests without it ({_described(contact)}). Probability {share:.2f}."
 
@@ -112,8 +112,8 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
 def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) -> tuple[Effect, ...]:
     """Say which objects move when one is removed, and how likely.
 
-    An object moves in a draw of what is not known if it is at rest with all objects and not without the
-    removed one; what rests on it moves with it.
+    In a sampled scene, an object moves if it is at rest with all objects, but not without the removed one;
+    what rests on it moves with it.
 
     Args:
         graph: The support graph.

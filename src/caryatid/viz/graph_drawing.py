@@ -61,8 +61,8 @@ def arrange(graph: SupportGraph) -> tuple[dict[str, Place], dict[Pair, list[Plac
 def layers(graph: SupportGraph) -> dict[str, int]:
     """Layer of each object in the support order: 0 for the table, else one more than its highest supporter.
 
-    Edges count in the order bottom-up, doubtful bottom-up, lean, top-down (turned round, for what
-    presses from above lies higher); one that would close a circle is left out.
+    Edges count in the order bottom-up, doubtful bottom-up, lean, top-down (reversed, because what
+    presses from above lies higher); one that would close a cycle is left out.
     """
     order = nx.DiGraph()
     order.add_nodes_from(o.id for o in graph.objects)

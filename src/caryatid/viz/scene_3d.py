@@ -18,7 +18,7 @@ LETTER = 0.024
 """Height of a name plate [m]."""
 _CHECK = (
     "<script>if (!document.createElement('canvas').getContext('webgl2')) document.body.replaceChildren("
-    "'This browser shows no 3D: WebGL is missing or switched off.');</script>"
+    "'This browser cannot show 3D: WebGL is missing or disabled.');</script>"
 )
 """Says so in place of the shapes where the browser cannot draw them."""
 

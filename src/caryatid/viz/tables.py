@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Entry(NamedTuple):
-    """One place of a table: what it says, the colour `#rrggbb` of the chip before it, whether in doubt."""
+    """One cell of a table: its text, the colour `#rrggbb` of the chip before it, whether it is doubtful."""
 
     text: str
     colour: str = ""
