@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 
 install: $(VENV)/.installed
 
-# What users need; tests and tools, which take longer to install, come with the other targets.
+# Install only what users need. The other targets also install tests and tools, which takes longer.
 $(VENV)/.usable: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
@@ -23,11 +23,11 @@ demo: $(VENV)/.usable
 test: install
 	$(BIN)/python -m pytest
 
-# Hostile input at every door; SEED=1 makes up other cases.
+# Give malformed data to every input. SEED=1 generates other cases.
 fuzz: install
 	$(BIN)/python -m pytest tests/fuzz.py -n 2 --hypothesis-seed=$(or $(SEED),0)
 
-# What the viewer's tests look at it with. Elsewhere than on Debian and its like, install one and set CHROMIUM.
+# Install Chromium for the viewer's tests. On systems without apt, install a browser yourself and set CHROMIUM.
 chromium:
 	@for name in "$$CHROMIUM" chromium chromium-browser google-chrome google-chrome-stable chrome; do \
 		test -n "$$name" && command -v "$$name" && exit 0; done; \
@@ -51,12 +51,12 @@ package: install
 accuracy-gate: install
 	$(BIN)/python benchmarks/accuracy.py suite --gate
 
-# A peer that cannot be installed is a row of the benchmark that says so, and is tried again next time.
+# If a peer cannot be installed, its row in the benchmark says so, and the next run tries again.
 $(VENV)/.peers: $(VENV)/.installed
 	for peer in open3d pyransac3d cgal; do \
 		$(BIN)/python -m pip install --quiet --constraint constraints.txt $$peer || failed="$$failed $$peer"; \
 	done; \
-	if test -z "$$failed"; then touch $@; else echo "could not be installed:$$failed"; fi
+	if test -z "$$failed"; then touch $@; else echo "could not install:$$failed"; fi
 
 bench: $(VENV)/.peers
 	$(BIN)/python benchmarks/bench.py --docs docs/performance --out bench.json --update

@@ -1,12 +1,12 @@
-"""How well the loop finds support graphs: F1 per view over scenes, planners, seeds, and on real frames.
+"""Measure how well the loop finds support graphs: F1 per view, on simulated scenes and on recordings.
 
     python benchmarks/accuracy.py suite [NAMES…] [--gate | --update]
     python benchmarks/accuracy.py extract RECORDINGS… --segmentation labels
     python benchmarks/accuracy.py exact SCENES…
 
-`suite` measures the settings the committed baseline is of, all where no NAMES are given. RECORDINGS are BOP
-folders with masks and gt.json. `exact` infers supports from the true shapes. `caryatid benchmark` compares
-planners and settings with confidence intervals.
+`suite` runs the suites of the committed baseline: all of them, or only NAMES. RECORDINGS are BOP folders with
+masks and gt.json. `exact` infers supports from the true shapes. `caryatid benchmark` compares planners and
+settings with confidence intervals.
 """
 
 from __future__ import annotations
@@ -48,36 +48,36 @@ from caryatid.support.relations import infer
 
 BASELINE = Path(__file__).with_name("accuracy_baseline.json")
 LEAST_READINGS = 200
-"""Objects of which a simulated frame shows less are not in its ground truth [px]; 2 cm at 1 m."""
+"""Minimum readings of an object in a simulated frame for its ground truth to include it [px]: 2 cm at 1 m."""
 EASY = (
     *("tower", "bridge", "counterweight", "leaning_plank", "hidden_stack", "shelf", "clutter"),
     *(f"pile-{size}-{seed}" for seed, size in enumerate(range(4, 16, 2), start=1)),
 )
-"""Designed scenes, and piles of 4–14 primitives."""
+"""Hand-designed scenes, and piles of 4–14 primitives."""
 DENSE = tuple(f"dense-{10 + seed % 8}-{seed}" for seed in range(200, 216))
-"""Heaps of 10–17 objects between screens and walls, of seeds nothing was developed with."""
+"""Heaps of 10–17 objects between screens and walls; development used none of these seeds."""
 PACKED = tuple(f"packed-20-{seed}" for seed in range(1, 6))
 """Twenty objects, each touching another."""
 MEANS, POOLED = ("f1", "edge_recall", "mean_iou"), ("f1", "found", "invented")
-"""Figures of a suite: means over scenes; `found` and `invented` of all scenes' objects."""
+"""Figures of a suite: means over scenes; `found` and `invented` are shares of the objects of all scenes."""
 Row = dict[str, Any]
 """`scene`, `seed`, `view` (from 1), and figures."""
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Scenes under one setting.
+    """Scenes measured with the same settings.
 
     Attributes:
         scenes: Names of built-in scenes.
-        scored: After how many views figures are taken.
+        scored: Numbers of views after which figures are computed.
         segmentation: Where segments come from.
-        tolerance: How much worse than the baseline a figure may be [1]: three times the largest standard
-            deviation a figure of the suite has over seeds, which is twice that of a difference of two runs.
-        settings: Changes of the default settings.
-        figures: What is kept.
-        frames: Single frames of the scenes are extracted instead of exploring them.
-        against: Suite of undisturbed scenes; how far F1 falls below its is kept too.
+        tolerance: By how much a figure may be worse than the baseline [1]: three times the largest standard
+            deviation over seeds of any figure of the suite, about twice that of the difference of two runs.
+        settings: Changes to the default settings.
+        figures: Figures to compute.
+        frames: Extract single frames of the scenes instead of exploring them.
+        against: Suite of the undisturbed scenes; the drop in F1 from it is another figure.
     """
 
     scenes: tuple[str, ...]
@@ -90,7 +90,7 @@ class Suite:
     against: str = ""
 
     def tasks(self, seeds: int) -> list[Callable[[], list[Row]]]:
-        """What is measured, scene by scene."""
+        """Return the measurements, one per scene and seed."""
         measure = extract if self.frames else explore
         base = Episode("", segmentation=self.segmentation, settings=self.settings, views=max(self.scored))
         return [
@@ -111,11 +111,11 @@ SUITES: Mapping[str, Suite] = {
     "frames-labels": Suite(EASY, (1,), "labels", 0.02, figures=("f1",), frames=True),
     "frames-auto": Suite(EASY, (1,), "auto", 0.04, figures=POOLED, frames=True),
 }
-"""`noise` has four times the depth noise, `registration` views that are off by σ = 1 cm and 1°."""
+"""`noise` has four times the depth noise; in `registration`, poses are off by σ = 1 cm and 1°."""
 
 
 def explore(episode: Episode) -> list[Row]:
-    """Rows of an episode."""
+    """Run an episode and return its rows."""
     outcome = run_episode(episode)
     if outcome.error is not None:
         raise CaryatidError(f"{episode.scene}: {outcome.error}")
@@ -123,9 +123,10 @@ def explore(episode: Episode) -> list[Row]:
 
 
 def extract(episode: Episode) -> list[Row]:
-    """Extract a recording, and score the graph after each frame by the pixels of all frames so far.
+    """Extract a recording, and score the graph after each frame by the masks of all frames so far.
 
-    The scene is a BOP folder, or a built-in one, of which a simulated frame without a pose is recorded.
+    The scene is a BOP folder or a built-in scene. Of a built-in scene, one simulated frame without a pose is
+    recorded first.
     """
     config = read_settings(None, episode.settings)
     if is_builtin(episode.scene):
@@ -151,7 +152,7 @@ def extract(episode: Episode) -> list[Row]:
 
 
 def infer_exactly(name: str) -> list[Row]:
-    """Row of the supports between the true shapes of a built-in scene, on a table wider than it."""
+    """Infer supports from the true shapes of a built-in scene, on a table wider than the scene."""
     started, truth = time.perf_counter(), true_scene_from_simulation(load_scene(name))
     table = Box(transforms.rigid(np.eye(3), (0.0, 0.0, truth.table_top - 0.02)), np.array([3.0, 3.0, 0.04]))
     objects = [SceneObject(truth.table or "table", SUPPORT_LABEL, table, "support_surface")]
@@ -183,14 +184,14 @@ def record_frame(scene: str, folder: Path, config: Config, seed: int) -> None:
 
 
 def figures(rows: pd.DataFrame) -> dict[str, float]:
-    """Means of rows, and the shares of their objects together that are `found` and `invented`."""
+    """Return the means of rows, and the `found` and `invented` shares of all their objects together."""
     true, returned, matched = rows[["objects", "returned", "matched"]].sum()
     shares = {"found": matched / max(true, 1), "invented": (returned - matched) / max(returned, 1)}
     return rows.mean(numeric_only=True).to_dict() | shares
 
 
 def measures(rows_of: Mapping[str, Sequence[Row]]) -> list[Measure]:
-    """Figures of suites from the rows of each, named `suite.scenes.figure@views`."""
+    """Compute the figures of suites from their rows, named `suite.scenes.figure@views`."""
     means = {}
     for name, rows in rows_of.items():
         frame = pd.DataFrame(rows)
@@ -216,31 +217,31 @@ def _group(scene: str) -> str:
 
 
 def show_rows(rows: Sequence[Row], console: Console, title: str) -> None:
-    """Print F1 per view and other means after the last view, a line a family, and the worst scenes."""
+    """Print F1 per view and other means after the last view, one line per family, and the worst scenes."""
     frame = pd.DataFrame(rows)
     kinds = frame["scene"].map(family).rename("scenes")
     last = frame[frame["view"] == frame["view"].max()]
     f1 = frame.pivot_table("f1", kinds, "view")
     rest = last[["edge_precision", "edge_recall", "mean_iou", "perception_seconds"]].groupby(kinds).mean()
-    console.print(f"{title}: F1 by view, and the rest after the last")
+    console.print(f"{title}: F1 per view, and other means after the last view")
     print_table(f1.join(rest).round(3).reset_index(), console)
     worst = last.nsmallest(6, "f1")[["scene", "seed", "f1"]].itertuples(index=False)
-    console.print("lowest: " + ", ".join(f"{scene} (seed {seed}) {f1:.3f}" for scene, seed, f1 in worst))
+    console.print("lowest F1: " + ", ".join(f"{scene} (seed {seed}) {f1:.3f}" for scene, seed, f1 in worst))
 
 
 @dataclass(frozen=True)
 class SuiteRun(Gated):
-    """Measure the settings the committed baseline is of."""
+    """Run the suites of the committed baseline."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Suites. [default: all]"""
+    """Suites to run. [default: all]"""
     seeds: int = 1
-    """Seeds 0…n−1."""
+    """Number of seeds, from 0."""
 
     def run(self, console: Console) -> int:
         """Measure, print, and compare."""
         if unknown := [name for name in self.names if name not in SUITES]:
-            raise CaryatidError(f"no suite '{unknown[0]}': choose from {', '.join(SUITES)}")
+            raise CaryatidError(f"unknown suite '{unknown[0]}': choose from {', '.join(SUITES)}")
         names = self.names or tuple(SUITES)
         tasks = [(name, task) for name in names for task in SUITES[name].tasks(self.seeds)]
         rows: dict[str, list[Row]] = {name: [] for name in names}
@@ -255,10 +256,10 @@ class SuiteRun(Gated):
 
 @dataclass(frozen=True)
 class Extract(Spread):
-    """Extract graphs from recordings, frame after frame, and score them."""
+    """Extract graphs from recordings, frame by frame, and score them."""
 
     recordings: Annotated[tuple[str, ...], tyro.conf.Positional] = EASY
-    """BOP folders with masks and gt.json, or built-in scenes: one simulated frame of each."""
+    """BOP folders with masks and gt.json, or built-in scenes (one simulated frame each)."""
     segmentation: SegmentationMethod = "labels"
     """Where segments come from."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -276,10 +277,10 @@ class Extract(Spread):
 
 @dataclass(frozen=True)
 class Exact(Spread):
-    """Infer supports from the true shapes: the rest is the limit of what shapes tell of forces."""
+    """Infer supports from the true shapes; the remaining errors are what shapes cannot tell about forces."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = BENCHMARK["heaps"].scenes
-    """Built-in scenes. [default: the suite heaps of `caryatid benchmark`]"""
+    """Built-in scenes. [default: the suite `heaps` of `caryatid benchmark`]"""
 
     def run(self, console: Console) -> int:
         """Infer and print."""

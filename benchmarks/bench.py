@@ -1,9 +1,9 @@
-"""How fast it is: ours against open3d, pyransac3d, CGAL, volumetric planners and the machine's limit.
+"""Measure speed: ours against open3d, pyransac3d, CGAL, volumetric planners and the machine's limit.
 
     python benchmarks/bench.py [--only turn fit.cylinder] [--quick] [--docs docs/performance] [--gate]
 
-`make bench` installs the peers first and writes the page and the ratios to compare with; `make bench-gate`
-compares. A peer that cannot be imported is a row that says so.
+`make bench` installs the peers, writes the tables of the documentation, and updates the baseline ratios;
+`make bench-gate` compares with them. If a peer cannot be imported, its row says so.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from caryatid.errors import InputError
 BASELINE = Path(__file__).with_name("performance_baseline.json")
 """The committed ratios."""
 THREADS = ["omp", "tbb", "workqueue"]
-"""Numba's threading layers, users' first: Open3D brings a TBB that numba would try, and warn of."""
+"""Numba's threading layers, first the one users get; numba would otherwise try Open3D's TBB, and warn."""
 CALM = 0.2
-"""So many cores taken by others before a measurement are a system's own business [1]."""
+"""Background load: cores that other processes may use before a measurement without a warning [1]."""
 MEASUREMENTS: dict[str, Callable[[Effort], list[Row]]] = {
     "turn": speed.measure_turns,
     **{f"fit.{kind}": partial(measure_fits, kind) for kind in ("cylinder", "box", "sphere")},
@@ -49,39 +49,39 @@ MEASUREMENTS: dict[str, Callable[[Effort], list[Row]]] = {
     "large": speed.measure_large,
     "viewer": measure_viewer,
 }
-"""Name → what is measured; `turn` gives the rows of perceiving and of the stages too."""
+"""Name → measurement; `turn` also gives the rows of perception and of the stages."""
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure how fast it is."""
+    """Measure speed."""
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME…")] = ()
-    """What to measure, say `turn`, `fit` or `growth.views`. [default: all]"""
+    """Measurements to run, e.g. `turn`, `fit` or `growth.views`. [default: all]"""
     quick: bool = False
-    """Few runs and small sizes, in a few minutes: to see that it works, not to compare."""
+    """Do few runs at small sizes, in a few minutes: a check that the benchmark works, not for comparison."""
     real: Path = FULL.real
-    """Folder of recordings of real frames, BOP folders."""
+    """Folder that holds recordings of real frames (BOP folders)."""
     out: Path | None = None
-    """JSON file for the rows."""
+    """Write the rows to this JSON file."""
     docs: Path | None = None
-    """Folder for the tables the documentation shows: a CSV file for each group of rows."""
+    """Write the documentation's tables to this folder: one CSV file per group of rows."""
     gate: bool = False
-    """Fail where a ratio is worse than the committed baseline allows."""
+    """Fail if a ratio is worse than the committed baseline allows."""
     update: bool = False
-    """Make the ratios the committed baseline; those of what could not be measured stay."""
+    """Write the ratios to the committed baseline; ratios that could not be measured keep their values."""
 
 
 def selected(wanted: Sequence[str]) -> list[str]:
-    """Names of the measurements that names or beginnings of names ask for; all where there are none."""
+    """Return the measurements whose names equal or begin with the wanted names; all if none are given."""
     chosen = [n for n in MEASUREMENTS if not wanted or f"{n}.".startswith(tuple(f"{w}." for w in wanted))]
     if not chosen:
-        raise InputError("--only", "Nothing is called so", f"choose from {', '.join(MEASUREMENTS)}")
+        raise InputError("--only", "no measurement has this name", f"choose from {', '.join(MEASUREMENTS)}")
     return chosen
 
 
 def show(rows: Sequence[Row], console: Console) -> None:
-    """Print the table."""
+    """Print the table, its notes, and the number of targets met."""
     print_table(table_of_rows(rows).drop(columns="note"), console)
     for note in dict.fromkeys(row.note for row in rows if row.note):
         console.print(f"{next(row.name for row in rows if row.note == note)}: {note}", highlight=False)
@@ -91,7 +91,7 @@ def show(rows: Sequence[Row], console: Console) -> None:
 
 
 def write_docs(rows: Sequence[Row], folder: Path) -> None:
-    """Write a CSV file for each group of rows, without empty columns, and what they were measured on."""
+    """Write one CSV file per group of rows, without empty columns, and a description of the machine."""
     folder.mkdir(exist_ok=True)
     table = table_of_rows(rows)
     for group, part in table.groupby(table["row"].str.split(".").str[0], sort=False):
@@ -102,10 +102,10 @@ def write_docs(rows: Sequence[Row], folder: Path) -> None:
 
 
 def compare(rows_by_name: Mapping[str, Sequence[Row]], part: bool, console: Console) -> int:
-    """Compare the ratios with the baseline; returns the exit status.
+    """Compare the ratios with the baseline, and return the exit status.
 
-    What is worse is measured again, and the better figure counts: chance makes one worse more easily than
-    better. What could not be measured, for want of a peer, is reported and does not fail, unless nothing was.
+    A measurement with a worse ratio is repeated, and the better figure counts: noise slows a run more often
+    than it speeds one up. Ratios that lack a peer are reported; the gate fails only if no ratio was measured.
     """
     known = read_baseline(BASELINE)
     found = {m.name: m for rows in rows_by_name.values() for m in measures(rows)}
@@ -116,7 +116,7 @@ def compare(rows_by_name: Mapping[str, Sequence[Row]], part: bool, console: Cons
         return 1
     for name, rows in rows_by_name.items():
         if any(m.worse_than(known.get(m.name, m.value)) for m in measures(rows)):
-            console.print(f"measuring {name} again, for what is worse")
+            console.print(f"measuring {name} again, because a ratio is worse")
             for again in measures(MEASUREMENTS[name](FULL)):
                 found[again.name] = min(again, found.get(again.name, again), key=lambda m: m.value)
     return gate(found.values(), BASELINE, console)
@@ -126,16 +126,16 @@ def main() -> int:
     """Measure, print, write and compare."""
     args = tyro.cli(Bench)
     if args.docs is not None and (args.only or args.quick):
-        raise InputError("--docs", "the page is of all rows", "leave out --only and --quick")
+        raise InputError("--docs", "the page needs all rows", "omit --only and --quick")
     if args.quick and (args.update or args.gate):
-        raise InputError("--quick", "its figures are no medians to compare", "leave it out")
+        raise InputError("--quick", "its figures cannot be compared", "omit it")
     numba.config.THREADING_LAYER_PRIORITY = THREADS
     console = Console(width=None if sys.stdout.isatty() else 240)
     rows_by_name: dict[str, list[Row]] = {}
     for name in selected(args.only):
         busy = psutil.cpu_percent(0.5) / 100.0 * (os.cpu_count() or 1)
         if busy > CALM:
-            console.print(f"other processes hold {busy:.1f} cores: figures of {name} are not right")
+            console.print(f"other processes use {busy:.1f} cores: the figures of {name} are unreliable")
         console.print(f"measuring {name} …", end="")
         started = time.perf_counter()
         rows_by_name[name] = MEASUREMENTS[name](replace(QUICK if args.quick else FULL, real=args.real))
@@ -150,7 +150,7 @@ def main() -> int:
         args.out.write_text(json.dumps(about | {"rows": told}, indent=1) + "\n", encoding="utf-8")
     if args.docs is not None:
         write_docs(rows, args.docs)
-    if args.update:  # the ratios of rows not asked for, or without their peer, stay
+    if args.update:  # keep the ratios of rows that were not requested or lack their peer
         known = {f"{row.name}{figure}" for row in rows for figure in ("", ".to_peer", ".to_limit")}
         update_baseline(measures(rows), BASELINE, lambda name: bool(args.only) or name in known)
     return compare(rows_by_name, bool(args.only), console) if args.gate else 0

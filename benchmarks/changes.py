@@ -1,10 +1,10 @@
-"""Whether a change that nobody reports is noticed: one object taken away, moved or added between two views.
+"""Measure whether unreported changes are noticed: one object is removed, moved or added between two views.
 
     python benchmarks/changes.py [SCENES…] --segmentation auto
 
-Each scene is looked at three times; then one object that supports nothing is taken away, is moved by 12 cm,
-or appears. Two views later the changes the model tells of are compared with what was done, and its graph with
-the scene as it is by then. A run without a change has ten views.
+Each scene gets three views; then one object that supports nothing is removed, moved by 12 cm, or added. After
+two more views, the changes that the model reports are compared with the actual change, and its graph with the
+changed scene. A run without a change has ten views.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from caryatid.simulation.truth import GroundTruth, ground_truth
 from caryatid.simulation.world import SimulatedScene, bounds, posed, poses_of, strayed
 
 PILES = tuple(f"pile-{5 + k % 8}-{400 + k}" for k in range(60))
-"""Piles of 5–12 primitives, of seeds nothing else is measured with."""
+"""Piles of 5–12 primitives; no other measurement uses these seeds."""
 BEFORE, AFTER, UNCHANGED, SHIFT = 3, 2, 10, 0.12
-"""Views before and after a change, views without one, and how far an object is moved [m]."""
+"""Views before and after a change, views of a run without one, and the distance an object is moved [m]."""
 KINDS = ("removed", "moved", "added", "nothing")
 
 
 @dataclass(frozen=True)
 class Args(OnScenes):
-    """Change scenes between two views and see what is noticed."""
+    """Change scenes between two views, and count the changes that are noticed."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = PILES
     """Names of built-in scenes, or scene folders."""
     kinds: tuple[str, ...] = KINDS
-    """What is done to them."""
+    """Kinds of change: any of `removed`, `moved`, `added` and `nothing`."""
     segmentation: SegmentationMethod = "labels"
     """Where segments come from."""
 
 
 def measure(task: tuple[str, str, Args]) -> dict[str, Any] | None:
-    """One run; None where there is nothing that can be moved so."""
+    """Run one scene with one kind of change; None if no object can be changed in this way."""
     name, kind, args = task
     scene, _ = open_scene(name)
     rng = np.random.default_rng([args.seed, KINDS.index(kind), args.scenes.index(name)])
@@ -84,7 +84,7 @@ def measure(task: tuple[str, str, Args]) -> dict[str, Any] | None:
 
 
 def change(scene: SimulatedScene, kind: str, rng: np.random.Generator) -> tuple[Array, Array] | None:
-    """States (N, 7) of the objects before and after a change; None where no object can be moved so."""
+    """Return the states (N, 7) of the objects before and after a change; None if no object can be moved."""
     state, names = poses_of(scene), list(scene.object_bodies.values())
     carrying = {edge.supporter for edge in ground_truth(scene).edges}
     free = [k for k, body in enumerate(names) if body not in carrying]
@@ -100,7 +100,7 @@ def change(scene: SimulatedScene, kind: str, rng: np.random.Generator) -> tuple[
 
 
 def shifted(scene: SimulatedScene, state: Array, index: int, rng: np.random.Generator) -> Array | None:
-    """The state once an object was set down 12 cm away; None where it falls over, or meets others."""
+    """Return the state after an object is set down 12 cm away; None if it falls over or hits others."""
     names = list(scene.object_bodies.values())
     lifting = Lifting(scene.spec, names)
     (low, high), table = bounds(scene, index + 1), bounds(scene, 0)
@@ -120,7 +120,7 @@ def shifted(scene: SimulatedScene, state: Array, index: int, rng: np.random.Gene
 
 
 def truth_of(scene: SimulatedScene) -> TrueScene:
-    """The ground truth without what was put aside."""
+    """Return the ground truth without the objects that were set aside."""
     names = scene.object_bodies.values()
     gone = {body for body, height in zip(names, poses_of(scene)[:, 2], strict=True) if height > ASIDE / 2.0}
     truth = ground_truth(scene)

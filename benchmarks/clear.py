@@ -1,18 +1,18 @@
-"""What clearing a table by looking, taking and looking again harms, and how many views it takes.
+"""Clear tables by alternately looking and taking; measure the harm done and the views needed.
 
     python benchmarks/clear.py [SCENES…] --hands 1
     python benchmarks/clear.py dense-10-301 --goals 2
 
-Each scene is cleared in physics: the true objects are lifted, and what is disturbed counts. A scene is
-unharmed where no lift moved another object by more than 2 cm or 15°, and cleared where nothing is left. With
-goals, objects drawn at random are to be reached instead; the fewest lifts are those of a search on the true
-scene, breadth first, among the objects that stand in one another's way.
+Each scene is cleared in a physics simulation: the true objects are lifted, and disturbed objects are counted.
+A scene is unharmed if no lift moves another object by more than 2 cm or 15°. It is cleared if no object is
+left. With `--goals`, the task is to reach randomly drawn objects instead; a breadth-first search on the true
+scene, among the objects that are in the way, finds the fewest lifts.
 
     python benchmarks/clear.py --set gripper.kind=parallel
 
-With a gripper, each lift is first carried out by a simulated one: a free-flying hand moves along the approach
-among the true objects, closes its fingers with 30 N, and lifts the object by friction. A grasp is clear if it
-touches nothing but its object; it holds if the object rises with it.
+With a gripper, a simulated one first performs each lift: a free-flying hand moves along the approach among
+the true objects, closes its fingers with 30 N, and lifts the object by friction. A grasp is clear if it
+touches only its object; it holds if the object rises with it.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ from caryatid.simulation.world import SimulatedScene, poses_of, quaternion
 
 @dataclass(frozen=True)
 class Args(OnScenes):
-    """Clear scenes in physics."""
+    """Clear scenes in a physics simulation."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = (*HEAPED, *DENSE)
     """Names of built-in scenes, or scene folders."""
     hands: Literal[1, 2] = 1
-    """Hands there are."""
+    """Number of hands."""
     goals: int = 0
-    """Objects to reach in each scene, one by one; 0 = take everything."""
+    """Number of objects to reach in each scene, one by one; 0 clears the whole scene."""
     segmentation: SegmentationMethod = "labels"
     """Where segments come from."""
 
 
 def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
-    """Clear one scene, or reach each goal in it: a row for each."""
+    """Clear one scene, or reach each goal in it; return one row per run."""
     name, args = task
     scene, _ = open_scene(name)
     chosen = args.drawn(name, list(scene.object_bodies), args.goals) if args.goals else [None]
@@ -69,7 +69,7 @@ def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
 
 
 def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> dict[str, Any]:
-    """Clear a scene, or reach the body with a label."""
+    """Clear a scene, or reach the body with the goal's label."""
     config = read_settings(None, args.set)
     simulation = make_simulation(scene, config, noise=args.noise, seed=args.seed)
     known: dict[str, Any] = {"segmentation": args.segmentation, "seed": args.seed, "config": config}
@@ -103,15 +103,15 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
 def grasped(
     scene: SimulatedScene, state: Array, grasp: Grasp, body: str, gripper: GripperConfig
 ) -> tuple[list[str], bool]:
-    """The bodies other than its own that a simulated gripper touches, and whether it lifts its own."""
+    """Simulate a grasp; return the other bodies it touches, and whether it lifts its own."""
     spec, T = scene.spec.copy(), grasp.T_world_gripper
-    # Elliptic cones with stiff friction, as MuJoCo's documentation advises for grasps.
+    # MuJoCo's documentation recommends elliptic cones with stiff friction for grasps.
     spec.option.timestep, spec.option.cone, spec.option.impratio = 0.002, mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
     start, R = T[:3, 3] - grasp.travel * T[:3, 2], T[:3, :3]
     spec.worldbody.add_body(name="goal", mocap=True, pos=start, quat=quaternion(R))
     hand = spec.worldbody.add_body(name="gripper", pos=start, quat=quaternion(R), gravcomp=1.0)
     hand.add_freejoint()
-    # A body that only follows a mocap body, and is none, has a velocity, so that friction can drag things.
+    # A mocap body has no velocity. A body welded to one does, so its friction can drag objects.
     weld = spec.add_equality(name1="goal", name2="gripper", type=mujoco.mjtEq.mjEQ_WELD, solref=[0.005, 1.0])
     weld.objtype, weld.data = mujoco.mjtObj.mjOBJ_BODY, [*[0.0] * 6, 1.0, *[0.0] * 3, 1.0, 0.0]
     parts, closing = gripper_boxes(gripper, grasp.width), gripper.kind == "parallel"
@@ -162,7 +162,7 @@ def grasped(
 
 
 def fewest(scene: SimulatedScene, goal: str, config: Config) -> int:
-    """Number of lifts that take a body, each of which disturbs nothing; 0 where 200 states show no way."""
+    """Return the fewest lifts that reach a body and disturb nothing; 0 if 200 searched states show no way."""
     names = list(scene.object_bodies.values())
     lifting, target = Lifting(scene.spec, names), names.index(goal)
     queue = deque[tuple[tuple[int, ...], Array]]([((), poses_of(scene))])
@@ -185,7 +185,7 @@ def fewest(scene: SimulatedScene, goal: str, config: Config) -> int:
 
 
 def summary(rows: pd.DataFrame) -> dict[str, float]:
-    """Shares of scenes, and figures per lift."""
+    """Return shares of scenes, and figures per lift."""
     unharmed = rows["harmed"] == 0
     found = {"runs": len(rows), "unharmed": unharmed.mean(), "cleared": rows["cleared"].mean()}
     found |= {"both": (unharmed & (rows["cleared"] == 1.0)).mean()}

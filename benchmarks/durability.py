@@ -1,12 +1,11 @@
-"""Is anything lost that was acknowledged? Commands killed at random moments, and clients under load.
+"""Check that no acknowledged data is lost: kill commands at random moments, and put load on a service.
 
     python benchmarks/durability.py [--only runs load] [--kills 200] [--views 1000] [--clients 50]
 
-`session add`, `session take` and `serve` are killed; after each kill the session is opened and its graph
-compared with that of the same views without any kill. `explore`, `extract`, `clear`, `benchmark` and the
-first compilation are killed too: what lies there is whole, and the next run continues or replaces it and
-cleans up. Then clients put load on a service, hostile ones among them. An `AssertionError` says what was
-lost.
+`session add`, `session take` and `serve` are killed; after each kill, the session is opened and its graph is
+compared with that of the same views without a kill. `explore`, `extract`, `clear`, `benchmark` and the first
+compilation are killed too: their output stays whole, and the next run continues or replaces it and cleans up.
+Then clients, some of them hostile, put load on a service. An `AssertionError` says what was lost.
 """
 
 from __future__ import annotations
@@ -57,15 +56,15 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 from robot_client import RobotClient
 
 SENSOR = SensorConfig(width=160, height=120, focal=131.25)
-"""Small images: a view takes a tenth of a second, so that much happens in little time."""
+"""Small images: a view takes a tenth of a second, so many views fit into a short time."""
 SMALL = [f"--set=sensor.{name}={getattr(SENSOR, name)}" for name in ("width", "height", "focal")]
 
-FORKS = multiprocessing.get_context("forkserver")  # processes that have imported everything, begun nothing
+FORKS = multiprocessing.get_context("forkserver")  # its processes have imported everything and run nothing
 FORKS.set_forkserver_preload(["caryatid.sessions.session", "caryatid.cli.sessions", "caryatid.service"])
 
 
 def start(arguments: Sequence[object], said: Path) -> BaseProcess:
-    """Start a command of caryatid in a process of its own, its output to a file."""
+    """Start a caryatid command in its own process; its output goes to a file."""
     process = FORKS.Process(target=_run, args=([str(a) for a in arguments], said), daemon=True)
     process.start()
     return process
@@ -80,7 +79,7 @@ def _run(arguments: list[str], said: Path) -> None:
 
 
 def kill(process: BaseProcess) -> int:
-    """Kill a command; returns its exit status, -9 unless it ended before."""
+    """Kill a command and return its exit status, -9 unless it ended before."""
     process.kill()
     process.join()
     assert process.exitcode is not None
@@ -88,18 +87,18 @@ def kill(process: BaseProcess) -> int:
 
 
 def address_of(said: Path) -> str:
-    """Where a service that was just started is."""
+    """Wait for a service that was just started, and return its address."""
     end = time.monotonic() + 60.0
     while time.monotonic() < end:
         try:
             return str(json.loads(said.read_text())["address"])
         except (OSError, ValueError):
             time.sleep(0.005)
-    raise RuntimeError(f"the service does not start: {said.read_text()}")
+    raise RuntimeError(f"the service did not start: {said.read_text()}")
 
 
 def views_around(scene: str, count: int) -> list[View]:
-    """Views of a scene from around it, with the noise of a Carmine, and depth in whole millimetres."""
+    """Return views from all around a scene, with the noise of a Carmine and depth rounded to millimetres."""
     rng = np.random.default_rng(0)
     camera = SimulatedCamera(load_scene(scene), "carmine", rng=rng, sensor=SENSOR)
     centre_world = np.array([0.0, 0.0, 0.75])
@@ -115,31 +114,31 @@ def views_around(scene: str, count: int) -> list[View]:
 
 
 def sent(view: View) -> dict[str, Any]:
-    """A view as a robot sends it."""
+    """Return a view as a robot sends it."""
     assert view.labels is not None
     depth, labels = png(np.round(1e3 * view.depth).astype(np.uint16)), png(view.labels.astype(np.uint16))
     return {"depth": depth, "K": view.K.tolist(), "T_world_camera": view.pose.tolist(), "labels": labels}
 
 
 def graphs_of(views: Sequence[View]) -> list[str]:
-    """graph.json after none, one, two … of the views."""
+    """Return graph.json after zero, one, two … of the views."""
     scene = Scene(segmentation="labels")
     return [graph_text(scene.graph), *(graph_text(scene.update(view)) for view in views)]
 
 
 def views_in(session: Path, acknowledged: int, graphs: Sequence[str]) -> int:
-    """How many views a session has after a kill: those acknowledged, and perhaps one more."""
+    """Check and return how many views a session has after a kill: those acknowledged, at most one more."""
     with Session.open(session) as opened:
         found = opened.views
-        assert 0 <= found - acknowledged <= 1, f"{found} views where {acknowledged} were acknowledged"
-        assert graph_text(opened.graph) == graphs[found], "the session is not what its views make it"
+        assert 0 <= found - acknowledged <= 1, f"{found} views, but {acknowledged} were acknowledged"
+        assert graph_text(opened.graph) == graphs[found], "the session differs from one of the same views"
     return found
 
 
 def judge(tally: Counter[str], status: int, new: int, said: Path) -> None:
-    """Count what became of one view or report: acknowledged, or killed before or after it was kept."""
+    """Count the outcome of one view or report: acknowledged, or killed before or after it was stored."""
     if status == 0:
-        assert new == 1, "what was acknowledged is lost"
+        assert new == 1, "an acknowledged view or report is lost"
         tally["acknowledged"] += 1
     else:
         assert status == -9, said.read_text()
@@ -148,9 +147,9 @@ def judge(tally: Counter[str], status: int, new: int, said: Path) -> None:
 
 
 def kill_adding(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `session add` at random moments; every other time once it has begun to write.
+    """Kill `session add` at random moments; every other time after it has begun to write.
 
-    Returns what became of the views: killed before or after they were kept, or not killed in time.
+    Returns the counts of views: killed before or after they were stored, or acknowledged before the kill.
     """
     chance, tally, graphs = random.Random(seed), Counter[str](), graphs_of(views)
     words: list[list[str]] = []
@@ -188,9 +187,9 @@ def kill_adding(folder: Path, views: Sequence[View], kills: int, seed: int) -> C
 
 
 def kill_taking(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `session take` at random moments, while it takes one object after the other.
+    """Kill `session take` at random moments, while it takes one object after another.
 
-    Returns what became of the reports, as `kill_adding` does of views.
+    Returns the counts of reports, as `kill_adding` does for views.
     """
     chance, tally, usual = random.Random(seed), Counter[str](), 1.0
     scene = Scene(segmentation="labels")
@@ -221,7 +220,7 @@ def kill_taking(folder: Path, views: Sequence[View], kills: int, seed: int) -> C
 
 
 def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `serve` while two clients add views to a session each; returns what became of these."""
+    """Kill `serve` while two clients each add views to a session; return the counts of the views."""
     chance, tally, graphs = random.Random(seed), Counter[str](), graphs_of(views)
     payloads, kept = [sent(view) for view in views], {"table-0": 0, "table-1": 0}
     for name in kept:
@@ -263,9 +262,9 @@ def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> 
 
 
 def kill_runs(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `explore` and `extract` over an older run, half of the times while they publish.
+    """Kill `explore` and `extract` while they replace an older run, half of the time while they publish.
 
-    After each kill a run is there, whole, or the next one recovers it; and nothing stays beside it.
+    After each kill, a whole run exists or the next command recovers it; no other files remain at the end.
     """
     chance, tally = random.Random(seed), Counter[str]()
     write_recording(folder / "recording", views[:2])
@@ -294,12 +293,12 @@ def kill_runs(folder: Path, views: Sequence[View], kills: int, seed: int) -> Cou
         tally["ended before" if status == 0 else "killed"] += 1
         if not run.exists():
             tally["recovered"] += 1
-            assert cli.main([*map(str, words), "--set=sensor.width=0"]) != 0  # a command that is refused
+            assert cli.main([*map(str, words), "--set=sensor.width=0"]) != 0  # an invalid command
         _check_run(run)
     for number, words in enumerate(commands):
         run = folder / f"runs-{number}" / "run"
         _finish([*words, "--out", run, "--quiet", "--seed", kills + 1], folder / "said")
-        assert os.listdir(run.parent) == ["run"], "something stays after the next run"
+        assert os.listdir(run.parent) == ["run"], "other files remain after the next run"
         assert _check_run(run) == kills + 1
     return tally
 
@@ -309,7 +308,7 @@ def _any(folder: Path, pattern: str) -> bool:
 
 
 def _check_run(folder: Path) -> int:
-    """Read a run as a whole; returns its seed."""
+    """Read a whole run and return its seed."""
     run = read_run(folder)
     assert len(run.views) == len(run.record["steps"])
     assert all(view.load_labels().any() for view in run.views)
@@ -317,7 +316,7 @@ def _check_run(folder: Path) -> int:
 
 
 def kill_clearing(folder: Path, _: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `clear` at random moments; the same command continues, and ends as it does without any kill."""
+    """Kill `clear` at random moments; the same command continues, and ends as it does without a kill."""
     chance, tally = random.Random(seed), Counter[str]()
     words = ["clear", "tower", "--no-report", "--hands", 1, "--quiet", *SMALL, "--out"]
     begun = time.monotonic()
@@ -331,17 +330,17 @@ def kill_clearing(folder: Path, _: Sequence[View], kills: int, seed: int) -> Cou
         assert status in (0, -9), (folder / "said").read_text()
         tally["killed" if status else "ended"] += 1
         found = len(read_run(run).views) if run.exists() else 0
-        assert found >= known, "views that were kept are lost"
+        assert found >= known, "stored views are lost"
         known = found
         if status == 0:
-            assert os.listdir(run.parent) == ["run"], "something stays after the run"
-            assert read_run(run).record["lifts"] == whole.record["lifts"], "it ended differently"
+            assert os.listdir(run.parent) == ["run"], "other files remain after the run"
+            assert read_run(run).record["lifts"] == whole.record["lifts"], "the lifts differ"
             run, known = folder / f"runs-{tally['ended']}" / "run", 0
     return tally
 
 
 def kill_benchmark(folder: Path, _: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill a benchmark and its workers at random moments; finished episodes stay, and none is done twice."""
+    """Kill a benchmark and its workers at random moments; finished episodes are kept, and none runs twice."""
     chance, tally, out, known = random.Random(seed), Counter[str](), folder / "out", 0
     words = ["benchmark", "--suite=smoke", "--scenes=tower", "--planner=random", "--views=2", "--jobs=2"]
     command = [sys.executable, "-m", "caryatid", *words, f"--out={out}", *SMALL]
@@ -361,12 +360,12 @@ def kill_benchmark(folder: Path, _: Sequence[View], kills: int, seed: int) -> Co
                 assert len(store.outcomes) >= known, "a finished episode is lost"
                 known = len(store.outcomes)
     keys = [line["key"] for line in map(json.loads, (out / RESULTS).open()) if "key" in line]
-    assert len(keys) == len(set(keys)) == 4 * kills, "an episode is missing or done twice"
+    assert len(keys) == len(set(keys)) == 4 * kills, "an episode is missing or ran twice"
     return tally
 
 
 def kill_compiling(folder: Path, _: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill the first compilation at random moments; no compiler outlives it, and the last one ends soon."""
+    """Kill the first compilation at random moments; no compiler outlives it, and the next run completes."""
     chance, tally = random.Random(seed), Counter[str]()
     code = "from caryatid.runtime.compiling import compile_kernels; compile_kernels()"
     for number in range(kills):
@@ -380,13 +379,13 @@ def kill_compiling(folder: Path, _: Sequence[View], kills: int, seed: int) -> Co
         assert not _processes_of(str(folder)), "a compiler outlives its command"
         if number % 5 == 4 or number == kills - 1:
             subprocess.run([sys.executable, "-c", code], env=environment, check=True)
-            assert not list(folder.rglob("compiling/*")), "a folder of locks stays"
+            assert not list(folder.rglob("compiling/*")), "a folder of locks remains"
             tally["completed"] += 1
     return tally
 
 
 def _processes_of(text: str) -> list[int]:
-    """Processes with a text in their command line."""
+    """Return the processes whose command line contains a text."""
     return [p.pid for p in psutil.process_iter(["cmdline"]) if text in " ".join(p.info["cmdline"] or ())]
 
 
@@ -398,7 +397,7 @@ def _finish(arguments: Sequence[object], said: Path) -> None:
 
 
 def _wait_for(condition: Callable[[], bool], seconds: float) -> None:
-    """Wait until a condition holds, or for so long."""
+    """Wait until a condition holds, but at most this long [s]."""
     end = time.monotonic() + seconds
     while time.monotonic() < end and not condition():
         time.sleep(0.0005)
@@ -406,9 +405,9 @@ def _wait_for(condition: Callable[[], bool], seconds: float) -> None:
 
 @contextmanager
 def hostile_clients(address: str, count: int) -> Iterator[Counter[str]]:
-    """Have clients send half requests, nonsense and far too much, each as fast as it is answered.
+    """Have clients send incomplete, invalid and oversized requests, each as soon as the last is answered.
 
-    Yields what they got: statuses, or `closed`.
+    Yields the counts of the answers: statuses, or `closed`.
     """
     where, stop, tally = urlsplit(address), Event(), Counter[str]()
     head = b"POST /sessions/table-0/views HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
@@ -458,11 +457,11 @@ def put_load(
 ) -> tuple[dict[str, list[int]], list[float], list[float], Counter[str]]:
     """Have clients add views to sessions of a service, each view once, as fast as they can.
 
-    View n goes to session n modulo their number; client n adds every n-th view.
+    View n goes to session n modulo the number of sessions; client n modulo the number of clients sends it.
 
     Returns:
-        Of each session which of the views each of its views is; how long each answer took [s]; the memory of
-        the service after each answer [MB]; what hostile clients were answered.
+        The indices of each session's views, in its order; the duration of each answer [s]; the memory of the
+        service after each answer [MB]; the counts of the answers to hostile clients.
     """
     names = [f"table-{n}" for n in range(sessions)]
     orders: dict[str, list[int]] = {name: [] for name in names}
@@ -477,7 +476,7 @@ def put_load(
     def work(client: int) -> None:
         for number in range(client, len(views), clients):
             name, begun = names[number % sessions], time.monotonic()
-            # Otherwise two clients would be after one number, and one would have to ask again.
+            # Otherwise two clients would compete for one view number, and one would have to retry.
             with turns[name]:
                 robot.add(name, **sent(views[number]))
                 orders[name].append(number)
@@ -491,7 +490,7 @@ def put_load(
     assert service.pid is not None
     os.kill(service.pid, signal.SIGTERM)
     service.join()
-    assert service.exitcode == 0, "the service did not stop as it ought to"
+    assert service.exitcode == 0, "the service did not stop cleanly"
     for name, order in orders.items():
         scene = Scene(segmentation="labels")
         for number in order:
@@ -510,7 +509,7 @@ KILLS: dict[str, tuple[Callable[[Path, Sequence[View], int, int], Counter[str]],
     "benchmark": (kill_benchmark, 4),
     "compile": (kill_compiling, 10),
 }
-"""What is killed, and by how much its kills are divided, because it takes long."""
+"""Name → what to kill, and the divisor of the number of kills for commands that take long."""
 
 
 def main(
@@ -523,17 +522,17 @@ def main(
     hostile: int = 10,
     sessions: int = 8,
 ) -> None:
-    """Kill commands and put load on a service, and say what became of what was acknowledged.
+    """Kill commands and put load on a service; check that no acknowledged data is lost.
 
     Args:
-        only: Any of add, take, serve, runs, clear, benchmark, compile, load.
-        kills: Kills of each of `add`, `take` and `serve`; half as many of `runs`, a quarter of `clear` and
-            `benchmark`, a tenth of `compile`.
-        seed: Seed of the moments.
-        views: Views of the load.
-        clients: Clients that put it.
-        hostile: Clients that send nonsense meanwhile.
-        sessions: Sessions they add to; the service keeps four open.
+        only: Checks to run: any of add, take, serve, runs, clear, benchmark, compile, load.
+        kills: Number of kills for `add`, `take` and `serve` each; half as many for `runs`, a quarter for
+            `clear` and `benchmark`, a tenth for `compile`.
+        seed: Seed of the random moments.
+        views: Number of views in the load test.
+        clients: Number of clients that send these views.
+        hostile: Number of clients that send invalid requests meanwhile.
+        sessions: Number of sessions the views go to; the service keeps four of them open.
     """
     around = views_around("clutter", max(12, views))
     for what, (kill_some, divisor) in KILLS.items():
@@ -555,9 +554,9 @@ def main(
     level = [max(memory[k * views // 5 : (k + 1) * views // 5]) for k in range(5)]
     print(
         f"{views} views, {clients} clients, {sessions} sessions: none lost, graphs equal, "
-        f"{views / (time.monotonic() - begun):.1f} views/s; view and next view "
-        f"{seconds[len(seconds) // 2]:.2f} s in the median, at most {seconds[-1]:.2f} s; "
-        f"memory, highest of each fifth: {', '.join(f'{m:.0f}' for m in level)} MB; "
+        f"{views / (time.monotonic() - begun):.1f} views/s; a view and its next view take "
+        f"{seconds[len(seconds) // 2]:.2f} s in the median, {seconds[-1]:.2f} s at most; "
+        f"peak memory in each fifth of the answers: {', '.join(f'{m:.0f}' for m in level)} MB; "
         f"{hostile} hostile clients got {dict(sorted(answers.items()))}"
     )
 

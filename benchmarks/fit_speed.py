@@ -1,4 +1,4 @@
-"""Fits of single shapes against pyransac3d, CGAL and Open3D: time, and how far off the result is."""
+"""Compare fits of single shapes with pyransac3d, CGAL and Open3D: time and error."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from caryatid.sensing.clouds import estimate_normals
 Kind = Literal["box", "cylinder", "sphere"]
 Fitter = Callable[[], Estimate]
 RUNS = 3
-"""Runs on each sample, but of pyransac3d, which is slow: one."""
+"""Runs on each sample; pyransac3d is slow and runs once."""
 USUAL, SLOW = 5000, 10_000
-"""Points the targets speak of (only with these errors are taken, and shapes chosen), and fewest with which
-pyransac3d is left out: a cylinder would take it eight seconds."""
+"""Number of points for which targets hold, errors are computed and `choose` is measured; and the number from
+which pyransac3d is omitted, because a cylinder would take it eight seconds."""
 SIGMA = 0.001
 """Noise of the points along each axis [m]."""
 FIT = replace(fits.ONE_VIEW, threshold=THRESHOLD)
-"""Settings of our fit: every point has an error of its own, and the threshold is everybody's."""
+"""Settings of our fit: point errors are independent, and the threshold is the same as for the peers."""
 PYRANSAC3D, CGAL, CGAL_ALONE, MINIMAL = "pyransac3d", "CGAL", "CGAL without normals", "Open3D's minimal box"
 NAMES = {PYRANSAC3D: "pyransac3d", CGAL: "cgal", CGAL_ALONE: "cgal-alone", MINIMAL: "open3d"}
 """Last part of a row's name."""
@@ -46,18 +46,18 @@ FASTER = {
     ("cylinder", PYRANSAC3D): 1.0 / 200.0, ("cylinder", CGAL): 2.0, ("box", PYRANSAC3D): 1.0 / 50.0,
     ("box", MINIMAL): 1.0,
 }  # fmt: skip
-"""Maximum time relative to the peer's, where the kind of shape is given, as it is to the peers; for CGAL's
-cylinders also the maximum error."""
+"""Targets: maximum ratio of our time to the peer's if the kind of shape is given to both. Against CGAL's
+cylinders, our errors have a target too."""
 
 
 def measure_fits(kind: Kind, effort: Effort) -> list[Row]:
-    """Rows of one kind of shape, a sample a run; every fitter gets the same ones."""
+    """Measure one kind of shape; each run draws one sample, the same for all fitters."""
     settings = [(count, "one side") for count in effort.points] + [(USUAL, "all around")]
     return [row for count, side in settings for row in _compare(kind, count, side, effort.runs)]
 
 
 def _compare(kind: Kind, count: int, side: str, runs: int) -> Iterator[Row]:
-    """Rows of our fits beside the peers': time and, with the usual number of points, the errors."""
+    """Compare our fits with the peers': time and, for the usual number of points, errors."""
     peers = [
         p
         for p in PEERS[kind]
@@ -109,7 +109,7 @@ def _compare(kind: Kind, count: int, side: str, runs: int) -> Iterator[Row]:
 
 
 def _fitters(kind: Kind, points: Array, normals: Array, eye: Array) -> dict[str, Callable[[], Fitter]]:
-    """What makes each fitter of a sample, ours and the peers'."""
+    """Return functions that prepare each fitter, ours and the peers', for a sample."""
     return {
         "fit": lambda: _ours(points, normals, replace(FIT, shapes=(kind,))),
         "choose": lambda: _ours(points, normals, FIT),
@@ -122,16 +122,16 @@ def _fitters(kind: Kind, points: Array, normals: Array, eye: Array) -> dict[str,
 
 
 def _median_known(errors: Sequence[float]) -> tuple[float | None, float, int, int]:
-    """Median and spread of the errors where something was found, how many these are, and how many not."""
+    """Return median and spread of the known errors, their number, and the number of unknown ones."""
     known = [e for e in errors if not np.isnan(e)]
     value, spread = median(known) if known else (None, 0.0)
     return value, spread, len(known), len(errors) - len(known)
 
 
 def draw(kind: Kind, count: int, side: str, seed: int) -> tuple[Shape, Array, Array, Array]:
-    """A shape of table-top size, points (N, 3) on it [m], their normals (N, 3), and an eye (3,) [m].
+    """Draw a table-top shape, points (N, 3) on it [m], their normals (N, 3), and a viewpoint (3,) [m].
 
-    What is measured can be seen from the one side: two faces of a box, the mantle of a cylinder.
+    One side shows everything that is measured: two faces of a box, the lateral surface of a cylinder.
     """
     rng = np.random.default_rng([fits.KINDS.index(kind), count, seed])
     shape = fits.random_shape(kind, rng)
@@ -148,7 +148,7 @@ def draw(kind: Kind, count: int, side: str, seed: int) -> tuple[Shape, Array, Ar
 
 
 def _ours(points: Array, normals: Array, config: FitConfig) -> Fitter:
-    """Our fit, behind a call like the peers'; given an eye (3,) for normals it estimates them first."""
+    """Return a function that runs our fit, like the peers'; given a viewpoint (3,), it estimates normals."""
 
     def call() -> Estimate:
         given = estimate_normals(points, normals, NEIGHBOURS) if normals.ndim == 1 else normals
@@ -164,7 +164,7 @@ def _ours(points: Array, normals: Array, config: FitConfig) -> Fitter:
 
 
 def errors_of(estimate: Estimate, shape: Shape) -> dict[str, float]:
-    """How far off: axis [deg], radius and mean of the extents [mm], volume [%]; NaN if unknown."""
+    """Return the errors of axis [deg], radius, mean extent [mm] and volume [%]; NaN if unknown."""
     if isinstance(shape, ct.Box):
         extents = np.sort(estimate.get("extents", np.full(3, np.nan)))
         off = float(np.abs(extents - np.sort(shape.extents)).mean())

@@ -1,19 +1,19 @@
-"""How well shapes are fitted to half views: points of one surface seen from one direction.
+"""Measure fits of shapes to half views: points of one surface seen from one direction.
 
     python benchmarks/fits.py [--trials 200] [--gate]
 
-A trial draws a shape of table-top size, a direction to look from and points all over what is seen of it
-within 80°, as dense in every part of the image; each gets Gaussian noise in space. Normals are those of the
-planes through each point's neighbours, as normals from depth are: noisy, rounded at edges. Measured is what
-such a view can tell:
+A trial draws a shape of table-top size, a viewing direction, and points on the surface seen within 80° of it,
+uniformly dense in the image. Each point gets Gaussian noise in space. Normals are those of planes through the
+neighbours of each point; like normals from depth, they are noisy, and rounded at edges. Only what such a view
+can tell is measured:
 
-* An extent of a box counts where a face along it is seen: that face shows its full length. Of a box of which
-  a single face is seen that is two extents of three.
-* Axis and radius of a cylinder always count, of one seen end-on (a disc) too; its height does not where the
-  mantle is not seen.
-* The right shape counts always, a single face or a disc included.
-* `within` is the share of the errors within twice the standard deviation the fit claims for an independent
-  error: 95 % where it is exact.
+* An extent of a box counts if a face along it is seen, because that face shows its full length. If a single
+  face is seen, two of the three extents count.
+* Axis and radius of a cylinder always count, even if it is seen end-on (a disc). Its height counts only if
+  the lateral surface is seen.
+* The right shape always counts, even for a single face or a disc.
+* `within` is the share of errors within twice the standard deviation that the fit claims for an independent
+  error: 95 % if the claim is exact.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ from caryatid.objects.fusion import axes_rotation
 BASELINE = Path(__file__).with_name("fits_baseline.json")
 """The committed figures."""
 SETTINGS = (("", 0.001, 5000), ("noisy.", 0.003, 800))
-"""Prefix of the measures, σ [m] and points: the targets' setting, and what a sensor gives at 1.5 m."""
+"""Prefix of the measures, σ [m], and number of points: the targets' setting, and a sensor's at 1.5 m."""
 KINDS = ("box", "cylinder", "sphere")
 STEEPEST = np.radians(80.0)
-"""Surfaces seen at a wider angle give no reading."""
+"""Maximum angle between a surface's normal and the viewing direction for readings [rad]."""
 ONE_VIEW = FitConfig(correlated=1.0, registration=0.0, rim=0.0)
-"""Every point here has an error of its own: no registration, no smoothing, no loss of pixels at rims."""
+"""Point errors are independent here: no registration error, no smoothing, no loss of pixels at rims."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One fit: the shape there was, the one found (`none` where nothing could be), and a note to read.
+    """One fit: the kind of the true shape, the kind found (`none` if none was), and a readable note.
 
-    `errors` are (quantity, error, claimed standard deviation) [mm, deg] of all that the view can tell; none
-    where the shape is wrong.
+    `errors` are (quantity, error, claimed standard deviation) [mm, deg] of everything the view can tell; none
+    if the shape is wrong.
     """
 
     kind: str
@@ -61,7 +61,7 @@ class Trial:
 
 
 def random_shape(kind: str, rng: np.random.Generator) -> Shape:
-    """A shape of table-top size in any pose."""
+    """Draw a shape of table-top size in any pose."""
     T = transforms.rigid(transforms.random_rotation(rng), rng.uniform(-0.3, 0.3, 3))
     if kind == "box":
         return Box(T, rng.uniform(0.04, 0.25, 3))
@@ -71,7 +71,7 @@ def random_shape(kind: str, rng: np.random.Generator) -> Shape:
 
 
 def half_view(shape: Shape, count: int, sigma: float, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Points (N, 3) [m] and normals (N, 3) of a view along a random direction, and that direction (3,)."""
+    """Draw a random viewing direction; return points (N, 3) [m], normals (N, 3), and the direction (3,)."""
     view = transforms.random_rotation(rng)[:, 2]
     dense, outward = dense_surface(shape, 40 * count, rng)
     cosine = outward @ view
@@ -82,7 +82,7 @@ def half_view(shape: Shape, count: int, sigma: float, rng: np.random.Generator) 
 
 
 def normals_of(points: Array, outward: Array) -> Array:
-    """Normals (N, 3) of planes through each point's neighbours, on the side of the outward ones (N, 3)."""
+    """Return normals (N, 3) of planes through each point's neighbours, oriented like outward ones (N, 3)."""
     _, near = cKDTree(points).query(points, NEIGHBOURS)
     spread = points[near] - points[near].mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
@@ -90,7 +90,7 @@ def normals_of(points: Array, outward: Array) -> Array:
 
 
 def dense_surface(shape: Shape, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Points (N, 3) [m] drawn evenly over the whole surface, and outward normals (N, 3)."""
+    """Draw points (N, 3) [m] uniformly on the whole surface, with outward normals (N, 3)."""
     if isinstance(shape, Sphere):
         outward = transforms.unit(rng.normal(size=(count, 3)))
         local = shape.radius * outward
@@ -132,7 +132,7 @@ def run_trial(task: tuple[str, int, float, int]) -> Trial:
 
 
 def errors_of(result: Fit, shape: Shape, view: Array) -> list[tuple[str, float, float]]:
-    """Signed errors of what a view can tell, and what the fit claims for them: lengths [mm], angles [deg]."""
+    """Return signed errors of what a view can tell, with their claimed σ: lengths [mm], angles [deg]."""
     assert result.uncertainty is not None
     found, claimed = result.shape, result.uncertainty
     turn, angle = axes_rotation(found, shape)
@@ -151,7 +151,7 @@ def errors_of(result: Fit, shape: Shape, view: Array) -> list[tuple[str, float, 
 
 
 def measures(prefix: str, trials: list[Trial]) -> list[Measure]:
-    """Share of right shapes; median and 95th percentile of each quantity's absolute error, and its mean."""
+    """Return the share of right shapes, and median, 95th percentile and bias of each quantity's error."""
     found = []
     for kind in KINDS:
         part = [t for t in trials if t.kind == kind]
@@ -177,7 +177,7 @@ class Args(Gated):
     """Fit shapes to synthetic half views."""
 
     trials: int = 200
-    """Trials a shape."""
+    """Number of trials per kind of shape."""
 
 
 def main() -> int:

@@ -1,11 +1,11 @@
-"""What exploring with a goal saves: is it known what taking an object away moves, and after how many views?
+"""Measure what exploring with a goal saves: the views needed to know what moves when the goal is removed.
 
     python benchmarks/goals.py [SCENES…] --goals 2
 
-Goals are drawn at random among a scene's objects. Each is explored for by itself; one exploration without a
-goal, which ends by itself too, is asked about all of them. A prediction is right for an object when it says
-with a probability of at least 0.5 that it moves and it does, or neither. What moves is asked of physics: when
-the goal is taken away at once, as for the ground truth of supports, and when it is lifted.
+Goals are drawn at random from a scene's objects. Each goal gets its own exploration; one exploration without
+a goal predicts for all goals. All explorations stop by themselves. An object is predicted to move if its
+probability is at least 0.5; the prediction is right if it agrees with a physics simulation. The simulation
+removes the goal in two ways: it deletes it at once, as for the ground truth of supports, or it lifts it.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ class Args(OnScenes):
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = (*DENSE, *PILES)
     """Names of built-in scenes, or scene folders."""
     goals: int = 2
-    """Goals in each scene."""
+    """Number of goals in each scene."""
     until: float | None = None
-    """Probability from which it is known what moves."""
+    """Probability at which a prediction counts as known."""
     planner: str = "support"
-    """Planner of the views."""
+    """Planner that chooses the views."""
 
 
 def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
-    """Explore one scene without a goal and with each goal: a row for each of these."""
+    """Explore one scene without a goal and with each goal; return one row per goal."""
     name, args = task
     config, (scene, truth) = read_settings(None, args.set), open_scene(name)
     bodies = scene.object_bodies
@@ -83,7 +83,7 @@ def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
 
 
 def predicted(graph: SupportGraph, goal: str, truth: TrueScene, config: Any) -> Set[str]:
-    """Names of the bodies that are said to move with the goal; an object that is no body has its id."""
+    """Return the bodies predicted to move with the goal; an object that matches no body appears by its id."""
     if all(o.id != goal for o in graph.objects):
         return set()
     bodies = bodies_of(graph, truth)
@@ -92,7 +92,7 @@ def predicted(graph: SupportGraph, goal: str, truth: TrueScene, config: Any) -> 
 
 
 def summary(rows: pd.DataFrame) -> dict[str, float]:
-    """Views with a goal and without, and shares of objects, and of goals with all objects, that are right."""
+    """Return views with and without a goal, and the shares of right objects and of wholly right goals."""
     sums = rows.sum(numeric_only=True)
     found = {"goals": len(rows), "views": rows["views"].mean(), "all views": rows["all views"].mean()}
     found |= {"share of views": sums["views"] / sums["all views"]}

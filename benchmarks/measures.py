@@ -1,4 +1,4 @@
-"""What the benchmarks share: measures, the committed baselines they are compared with, processes, tables."""
+"""Parts that the benchmarks share: measures, comparison with committed baselines, processes, tables."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Measure:
-    """One figure of a benchmark; `better` is `higher` or `lower`, the tolerance is in its unit."""
+    """One figure of a benchmark; `better` is `higher` or `lower`, and the tolerance is in `unit`."""
 
     name: str
     value: float
@@ -36,29 +36,29 @@ class Measure:
     tolerance: float
 
     def worse_than(self, baseline: float, tolerance: float = 0.0) -> bool:
-        """Whether it is worse than a baseline by more than a tolerance."""
+        """Return whether it is worse than a baseline by more than a tolerance."""
         loss = baseline - self.value if self.better == "higher" else self.value - baseline
         return loss > tolerance
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Options of a benchmark whose tasks are spread over processes."""
+    """Options of a benchmark that spreads its tasks over processes."""
 
     jobs: int = 4
-    """Processes."""
+    """Number of processes."""
     out: Path | None = None
-    """JSON file for all rows."""
+    """Write all rows to this JSON file."""
 
     def each(self, function: Callable[[T], R], tasks: Sequence[T], chunk: int = 1) -> list[R]:
-        """What a function gives for each task, run in processes."""
+        """Apply a function to each task, in several processes."""
         for library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
             os.environ.setdefault(f"{library}_NUM_THREADS", "1")
         with ProcessPoolExecutor(self.jobs, get_context("spawn")) as pool:
             return list(pool.map(function, tasks, chunksize=chunk))
 
     def write(self, rows: Any) -> None:
-        """Write the rows where asked to."""
+        """Write the rows to `out`, if it is given."""
         if self.out is not None:
             self.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
@@ -77,7 +77,7 @@ class OnScenes(Spread):
     """Settings, e.g. `--set active.effort=0.1`."""
 
     def drawn(self, name: str, labels: Sequence[int], goals: int) -> list[int]:
-        """Labels of the goals in one of the scenes."""
+        """Draw the labels of the goals in a scene."""
         rng = np.random.default_rng([self.seed, self.scenes.index(name)])
         chosen: list[int] = rng.choice(labels, min(goals, len(labels)), replace=False).tolist()
         return chosen
@@ -103,9 +103,9 @@ class Gated(Spread):
     """Options of a benchmark with a committed baseline."""
 
     gate: bool = False
-    """Fail where a figure is worse than the committed baseline."""
+    """Fail if a figure is worse than the committed baseline allows."""
     update: bool = False
-    """Make the figures the committed baseline; those of what was not measured stay."""
+    """Write the figures to the committed baseline; suites that were not run keep theirs."""
 
     def finish(
         self,
@@ -114,9 +114,9 @@ class Gated(Spread):
         console: Console,
         kept: Callable[[str], bool] = lambda name: False,
     ) -> int:
-        """Print measures, keep and compare them as asked for; returns the exit status.
+        """Print measures, write and compare them as the options ask, and return the exit status.
 
-        Names in the baseline that were not measured stay there where `kept` says so.
+        Baseline entries that were not measured stay if `kept` returns True for their names.
         """
         rows = [(m.name, f"{m.value:.3f}", m.unit, m.better, f"{m.tolerance:.3g}") for m in found]
         columns = ["measure", "value", "unit", "better", "± tolerated"]
@@ -127,20 +127,20 @@ class Gated(Spread):
 
 
 def update_baseline(found: Iterable[Measure], path: Path, kept: Callable[[str], bool]) -> None:
-    """Write measures as the baseline; others stay there where `kept` says so of their names."""
+    """Write measures as the baseline; other entries stay if `kept` returns True for their names."""
     values = {name: value for name, value in read_baseline(path).items() if kept(name)}
     values |= {m.name: m.value for m in found}
     path.write_text(json.dumps(values, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def read_baseline(path: Path) -> dict[str, float]:
-    """Read the value of each measure of a baseline."""
+    """Read a baseline: the value of each measure by name."""
     values: dict[str, float] = json.loads(path.read_text(encoding="utf-8"))
     return values
 
 
 def gate(measures: Iterable[Measure], path: Path, console: Console) -> int:
-    """Compare with a baseline; returns the exit status, 1 where a measure is worse than it may be."""
+    """Compare with a baseline, and return the exit status: 1 if a measure is worse than tolerated."""
     baseline, failed = read_baseline(path), 0
     for m in measures:
         if m.name not in baseline:
@@ -149,17 +149,17 @@ def gate(measures: Iterable[Measure], path: Path, console: Console) -> int:
             failed += 1
             was = f"was {baseline[m.name]:.4g} ± {m.tolerance:g}"
             console.print(f"worse: {m.name} = {m.value:.4g} {m.unit}, {was}")
-    console.print("gate: " + (f"{failed} measures are worse" if failed else "nothing is worse"))
+    console.print("gate: " + (f"{failed} measures are worse" if failed else "no measure is worse"))
     return min(failed, 1)
 
 
 def print_table(table: pd.DataFrame, console: Console) -> None:
-    """Print a table, all of it."""
+    """Print a whole table."""
     console.print(table.to_string(index=False), markup=False, highlight=False, soft_wrap=True)
 
 
 def run_main(main: Callable[[], int]) -> None:
-    """Run a benchmark's main function and exit with its status, or with what went wrong."""
+    """Run a benchmark's main function, and exit with its status or its error."""
     try:
         sys.exit(main())
     except CaryatidError as error:

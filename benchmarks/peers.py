@@ -1,6 +1,6 @@
-"""What we are compared with: other libraries, each behind one call, and a pass that hashes an image's voxels.
+"""The peers we compare with: other libraries, each behind one call, and a pass that hashes an image's voxels.
 
-What cannot be imported raises.
+A library that cannot be imported raises an error.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from caryatid.sensing.views import View
 
 OPEN3D, PYRANSAC3D, CGAL = "open3d", "pyransac3d", "CGAL.CGAL_Shape_detection"
 DISTRIBUTIONS = {OPEN3D: "open3d", PYRANSAC3D: "pyransac3d", CGAL: "cgal"}
-"""Module → the package of the registry it comes with."""
+"""Module → the PyPI package that contains it."""
 
 THRESHOLD = 0.004
-"""Distance within which points belong to a shape [m]: 4σ."""
+"""Maximum distance between a shape and its points [m]: 4σ."""
 ITERATIONS = 1000
-"""Of pyransac3d: its default for spheres; those for cuboids and cylinders are 5 and 10 times as many."""
+"""pyransac3d's default for spheres; its defaults for cuboids and cylinders are 5 and 10 times as high."""
 NEIGHBOURS = 20
-"""Points a normal is estimated from."""
+"""Number of points from which a normal is estimated."""
 
 _FOLDERS = re.compile(r"(?<![\w.])/(?:[^/\s'\"()]+/)+")
 _NUMBER = r"(-?[\d.]+(?:e[+-]?\d+)?)"
@@ -38,16 +38,16 @@ _TRIPLE = rf"\({_NUMBER}, {_NUMBER}, {_NUMBER}\)"
 
 
 Estimate = dict[str, Any]
-"""What a fitter says of a shape: `axis` (3,), `radius` [m] or `extents` (3,) [m]; or nothing."""
+"""A fitter's result: `axis` (3,), `radius` [m] or `extents` (3,) [m]; empty if it finds nothing."""
 
 
 def told(error: BaseException) -> str:
-    """What an error says, in one line, without the folders of this machine."""
+    """Return an error's message in one line, without the folders of this machine."""
     return _FOLDERS.sub("", " ".join(str(error).split())) or type(error).__name__
 
 
 def versions() -> str:
-    """The peers' versions, or that they are not there."""
+    """Return the peers' versions, or that they are not installed."""
     named = []
     for module, name in DISTRIBUTIONS.items():
         try:
@@ -61,14 +61,17 @@ def versions() -> str:
 
 
 def _open3d() -> Any:
-    """Open3D, told to say errors only; it warns of every box that cannot be turned."""
+    """Import Open3D and limit its log to errors; it warns about every box that it cannot orient."""
     o3d = import_module(OPEN3D)
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     return o3d
 
 
 def open3d_chain(view: View, max_depth: float) -> Callable[[], int]:
-    """Open3D from a depth image, readings up to a depth [m], to a box a cluster, counting the boxes."""
+    """Return a function that runs Open3D on a depth image, cropped at a depth [m], up to boxes of clusters.
+
+    The function returns the number of boxes.
+    """
     o3d = _open3d()
     height, width = view.depth.shape
     K = o3d.camera.PinholeCameraIntrinsic(width, height, view.K)
@@ -85,7 +88,7 @@ def open3d_chain(view: View, max_depth: float) -> Callable[[], int]:
         boxes = 0
         for k in range(clusters.max(initial=-1) + 1):
             cluster = rest.select_by_index(np.flatnonzero(clusters == k))
-            with suppress(RuntimeError):  # what lies in one plane has no box
+            with suppress(RuntimeError):  # coplanar points have no box
                 cluster.get_oriented_bounding_box()
                 boxes += 1
         return boxes
@@ -94,14 +97,14 @@ def open3d_chain(view: View, max_depth: float) -> Callable[[], int]:
 
 
 def open3d_box(points: Array) -> Callable[[], Estimate]:
-    """Open3D's box of the least volume around points (N, 3) [m]; their conversion is not part of the call."""
+    """Return a function that fits Open3D's minimum-volume box to points (N, 3) [m], converted beforehand."""
     o3d = _open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     return lambda: {"extents": np.asarray(cloud.get_minimal_oriented_bounding_box().extent)}
 
 
 def pyransac3d_fit(kind: str, points: Array) -> Callable[[], Estimate]:
-    """pyransac3d's fit of a `box`, `cylinder` or `sphere` to points (N, 3) [m]."""
+    """Return a function that fits a `box`, `cylinder` or `sphere` to points (N, 3) [m] with pyransac3d."""
     library = import_module(PYRANSAC3D)
 
     def call() -> Estimate:
@@ -118,9 +121,10 @@ def pyransac3d_fit(kind: str, points: Array) -> Callable[[], Estimate]:
 
 
 def cgal_fit(kind: str, points: Array, normals: Array | None) -> Callable[[], Estimate]:
-    """CGAL's efficient RANSAC of a `cylinder` or a `sphere`; with no normals it estimates them first.
+    """Return a function that fits a `cylinder` or `sphere` to points (N, 3) [m] with CGAL's efficient RANSAC.
 
-    Copying the points into CGAL's set, which goes through Python one by one, is not part of the call.
+    It first estimates normals if there are none. The points are copied into CGAL's set beforehand, because
+    they pass through Python one by one.
     """
     shapes = import_module(CGAL)
     kernel, sets = import_module("CGAL.CGAL_Kernel"), import_module("CGAL.CGAL_Point_set_3")
@@ -138,11 +142,11 @@ def cgal_fit(kind: str, points: Array, normals: Array | None) -> Callable[[], Es
             processing.pca_estimate_normals(cloud, NEIGHBOURS)
         lines = shapes.efficient_RANSAC(
             cloud, owner,
-            int(0.3 * len(points)),  # fewer points a shape make it look for more shapes than the one
+            int(0.3 * len(points)),  # with fewer points per shape, it looks for more than one shape
             THRESHOLD,
-            0.05,  # gap at which points of one shape are two [m]: wide, there is one; it is fastest so
+            0.05,  # gap that splits a shape in two [m]: wide, for there is only one, and fastest
             0.9,  # cosine of the angle between a point's normal and the shape's; the default
-            0.01,  # probability of overlooking a larger shape; the default
+            0.01,  # probability of missing a larger shape; the default
             False, False, kind == "cylinder", kind == "sphere", False,
         )  # fmt: skip
         return _read_cgal(lines[0]) if len(lines) else {}
@@ -151,7 +155,7 @@ def cgal_fit(kind: str, points: Array, normals: Array | None) -> Callable[[], Es
 
 
 def _read_cgal(line: str) -> Estimate:
-    """Read one of the lines CGAL describes shapes with."""
+    """Parse one of the lines in which CGAL describes shapes."""
     radius = re.search(rf"radius: ?{_NUMBER}", line)
     axis = re.search(rf"axis: {_TRIPLE}", line)
     found: Estimate = {} if radius is None else {"radius": float(radius[1])}
@@ -159,18 +163,18 @@ def _read_cgal(line: str) -> Estimate:
 
 
 EMPTY = -1
-"""What stands in a free place of a table; no key is negative."""
+"""Marks a free slot of a hash table; no key is negative."""
 REACH = 1 << 20
-"""Voxels along an axis, the origin in the middle [1]."""
+"""Number of voxels along an axis, with the origin in the middle [1]."""
 MIXER = np.uint64(0x9E3779B97F4A7C15)
-"""Odd, near 2⁶⁴ over the golden ratio: spreads keys over a table."""
+"""Odd number near 2⁶⁴ / golden ratio; it spreads keys over a hash table."""
 
 
 def hash_voxels(view: View, size: float) -> NDArray[np.int64]:
-    """Keys of the voxels of an edge [m] that hold a view's points, each once, in no order.
+    """Return the unique keys of the voxels of this size [m] that hold a view's points, in no order.
 
-    Each thread takes a band of the image; then each takes a share of the hashes, and enters the keys that
-    have one of them into an open-addressing table of its own.
+    Each thread first computes the keys of a band of the image. Then it takes a share of the hash values, and
+    enters the keys with these values into its own open-addressing table.
     """
     threads = get_num_threads()
     keys, counts = _keys(view.depth, view.K, view.pose, 1.0 / size, threads)
@@ -183,7 +187,7 @@ def hash_voxels(view: View, size: float) -> NDArray[np.int64]:
 def _keys(
     depth: NDArray[np.float32], K: Array, T: Array, scale: float, threads: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Keys of the points' voxels, a row a band of the image, no two neighbours the same; and how many."""
+    """Return the keys of the points' voxels, one row per band, without equal neighbours, and their counts."""
     height, width = depth.shape
     keys = np.empty((threads, (height // threads + 1) * width), dtype=np.int64)
     counts = np.zeros(threads, dtype=np.int64)
@@ -212,7 +216,7 @@ def _keys(
 def _tables(
     keys: NDArray[np.int64], counts: NDArray[np.int64], places: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Each thread's keys, once, at the beginning of its row, and how many."""
+    """Return each thread's unique keys, at the beginning of its row, and their counts."""
     threads = len(keys)
     found = np.empty((threads, counts.sum()), dtype=np.int64)
     taken = np.zeros(threads, dtype=np.int64)

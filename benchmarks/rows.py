@@ -1,4 +1,4 @@
-"""A row of the performance table: our time beside the peer's and the machine's limit, and its target."""
+"""Rows of the performance table: our time beside the peer's and the machine's limit, and the target."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from caryatid.geometry.transforms import Array
 
 T = TypeVar("T")
 PAUSE = 0.02
-"""Before each timed run [s]: the threads of what ran before have stopped waiting for more work by then."""
+"""Pause before each timed run [s]: after it, the threads of the previous run no longer wait for work."""
 TOLERANCE, EXPONENT_TOLERANCE = 0.3, 0.15
-"""How much worse a ratio (as a share of itself) or an exponent of growth may become [1]."""
+"""By how much a ratio (as a share of itself) or an exponent of growth may get worse [1]."""
 NOTHING, MISSED = "–", "missed"
 Limit = tuple[float, float]
-"""Bytes read and written, and multiplications and additions, that a stage cannot do without."""
+"""Minimum bytes that a stage reads and writes, and its minimum number of multiplications and additions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How many runs; sizes of fits [points], images [px], tables [objects], voxels [m]; views; recordings.
+    """Number of runs; sizes of fits [points], images [px], tables [objects], voxels [m]; views; recordings.
 
     `crowd` is the number of objects on a large table.
     """
@@ -53,18 +53,18 @@ class Row:
     """One line of the table.
 
     Attributes:
-        name: Of the row, its group before the first dot.
-        what: In words.
-        value: Ours, a median; None where it could not be measured.
-        unit: Of all values: `ms`, `s`, `deg`, `mm`, `%`, `MB`, or `1` for exponents.
-        spread: Between the quartiles of the runs, in the unit.
-        runs: How many the value is the median of.
-        peer: What it is compared with.
-        peer_value: The peer's figure; None where it could not be measured.
-        limit: What bounds it from below: a pass over the data, or arithmetic.
-        limit_value: How little it could be.
-        target: What the value, or where there is a peer the ratio to it, may be at most.
-        note: Why something is missing, or what else was found.
+        name: Name; its group precedes the first dot.
+        what: Description.
+        value: Our figure, a median; None if it could not be measured.
+        unit: Unit of all values: `ms`, `s`, `deg`, `mm`, `%`, `MB`, or `1` for exponents.
+        spread: Range between the quartiles of the runs, in the unit.
+        runs: Number of runs behind the median.
+        peer: What ours is compared with.
+        peer_value: The peer's figure; None if it could not be measured.
+        limit: What bounds the value from below: a pass over the data, or arithmetic.
+        limit_value: Lower bound of the value.
+        target: Maximum of the value or, if there is a peer, of the ratio to the peer's.
+        note: Why something is missing, or other findings.
     """
 
     name: str
@@ -82,22 +82,22 @@ class Row:
 
     @property
     def to_peer(self) -> float | None:
-        """Ours in peers: 0.5 is half of it."""
+        """Our value divided by the peer's."""
         return None if self.value is None or not self.peer_value else self.value / self.peer_value
 
     @property
     def to_limit(self) -> float | None:
-        """Ours in limits: 1 is the limit."""
+        """Our value divided by the limit."""
         return None if self.value is None or not self.limit_value else self.value / self.limit_value
 
     @property
     def met(self) -> bool | None:
-        """Whether the row is what is asked for; None where nothing is, or it could not be measured."""
+        """Whether the target is met; None without a target or a figure."""
         figure = self.to_peer if self.peer else self.value
         return None if self.target is None or figure is None else figure <= self.target
 
     def cells(self) -> dict[str, str]:
-        """The columns of the table."""
+        """Return the columns of the table."""
         verdict = {True: "met", False: MISSED, None: "not measured"}[self.met]
         asked = NOTHING
         if self.target is not None:
@@ -119,7 +119,7 @@ class Row:
 
 
 def table_of_rows(rows: Iterable[Row]) -> pd.DataFrame:
-    """The table, a line a row."""
+    """Return the table, one line per row."""
     return pd.DataFrame([row.cells() for row in rows])
 
 
@@ -134,7 +134,7 @@ def timed_row(
     target: float | None = None,
     note: str = "",
 ) -> Row:
-    """Make a row, in milliseconds, of runs [s] of ours and of a peer."""
+    """Make a row, in milliseconds, from the durations [s] of our runs and of a peer's."""
     value, spread = median([1e3 * t for t in ours])
     peer_value = median([1e3 * t for t in theirs])[0] if theirs else None
     bound, least = ("", None) if limit is None else limit_of(*limit)
@@ -142,13 +142,13 @@ def timed_row(
 
 
 def median(values: Sequence[float]) -> tuple[float, float]:
-    """Median of the values, and the distance between their quartiles."""
+    """Return the median of the values, and the range between their quartiles."""
     low, middle, high = np.percentile(values, (25.0, 50.0, 75.0))
     return float(middle), float(high - low)
 
 
 def measures(rows: Iterable[Row]) -> list[Measure]:
-    """What the gate compares: ratios of durations and exponents, much the same on another machine."""
+    """Return what the gate compares: ratios of durations, and exponents; machines differ little in them."""
     found = []
     for row in rows:
         for figure, ratio in (("to_peer", row.to_peer), ("to_limit", row.to_limit)):
@@ -160,7 +160,7 @@ def measures(rows: Iterable[Row]) -> list[Measure]:
 
 
 def timed(call: Callable[[], T], *, warm: bool = True) -> tuple[float, T]:
-    """Time one call [s] after a pause, called once right before where it is to be warm; also its result."""
+    """Time one call [s] after a pause, and return its result too; a warm call follows an untimed one."""
     time.sleep(PAUSE)
     if warm:
         call()
@@ -170,7 +170,7 @@ def timed(call: Callable[[], T], *, warm: bool = True) -> tuple[float, T]:
 
 
 def in_turns(calls: Mapping[str, Callable[[], object]], runs: int) -> dict[str, list[float]]:
-    """Time calls [s] by name, warm, one after the other and all of them again, so often."""
+    """Time warm calls [s] by name, in rounds of all of them."""
     found: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(runs):
         for name, call in calls.items():
@@ -180,7 +180,7 @@ def in_turns(calls: Mapping[str, Callable[[], object]], runs: int) -> dict[str, 
 
 @cache
 def machine() -> dict[str, float]:
-    """Bandwidth of the memory [B/s] (triad a = b + s·c), arithmetic [1/s] (product of matrices), threads."""
+    """Measure memory bandwidth [B/s] (triad a = b + s·c), arithmetic [1/s] (matrix product), and threads."""
     a, b, c = (np.full(16_000_000, v) for v in (0.0, 1.0, 2.0))
     M = np.random.default_rng(0).normal(size=(1500, 1500))
     found = in_turns({"triad": lambda: _triad(a, b, c, 3.0), "product": lambda: M @ M}, 9)
@@ -195,7 +195,7 @@ def _triad(a: Array, b: Array, c: Array, s: float) -> None:
 
 
 def limit_of(size: float, operations: float) -> tuple[str, float]:
-    """What takes longer of moving so many bytes and so many operations, and how long [ms]."""
+    """Return the data or the operations, whichever takes longer to process, and the time it takes [ms]."""
     passing, computing = size / machine()["bandwidth"], operations / machine()["arithmetic"]
     count, unit, seconds = (operations, "flop", computing) if computing > passing else (size, "B", passing)
     power = min(int(np.log10(max(count, 1.0)) // 3), 3)
@@ -207,12 +207,12 @@ def _figure(value: float | None, unit: str) -> str:
 
 
 def _ratio(value: float | None) -> str:
-    """Ours in others': below one as a fraction."""
+    """Format a ratio; below one, as a fraction."""
     if value is None:
         return NOTHING
     return f"1/{_digits(1.0 / value)}" if 0.0 < value < 1.0 else f"{_digits(value)} ×"
 
 
 def _digits(value: float) -> str:
-    """Three digits that count, or all those before the point."""
+    """Format a number with three significant digits, or with all digits before the decimal point."""
     return f"{value:,.0f}" if abs(value) >= 99.95 else f"{value:.3g}"

@@ -1,11 +1,11 @@
-"""How well automatic segmentation cuts single views into objects: found, invented, split, merged, by family.
+"""Measure how well automatic segmentation cuts single views into objects: found, invented, split, merged.
 
     python benchmarks/segmentation.py [SOURCES…] --views 4 [--gate]
 
 SOURCES are folders with scene.xml, names of built-in scenes, or BOP folders with masks. Views of scenes are
-simulated: the robot's first one and others it can reach, far from each other. Without SOURCES the views are
-of the built-in suite, the one the committed baseline is of. What is scored is `segment` alone, at the pixels
-that hold a reading; what the scene model makes of it is for `accuracy.py` to say.
+simulated: the robot's first view, and others that it can reach, far apart. Without SOURCES, the views are
+those of the built-in suite, which the committed baseline covers. Only `segment` is scored, at the pixels with
+a reading; `accuracy.py` scores what the scene model makes of the segments. Figures are per family of scenes.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ from caryatid.sensing.views import View
 from caryatid.sources import is_recording, open_source
 
 BUILT_IN = (*EASY, *(f"dense-{size}-{seed}" for seed, size in enumerate(range(10, 18, 2), start=1)))
-"""What is segmented where no sources are given."""
+"""Sources to segment if none are given."""
 BASELINE = Path(__file__).with_name("segmentation_baseline.json")
 LEAST_PIXELS = 200
-"""True objects with fewer readings are not asked for, nor are parts of them invented [px]; 2 cm at 1 m."""
+"""Minimum readings of a true object that counts [px]: 2 cm at 1 m. Segments of smaller ones are ignored."""
 MIN_IOU = 0.5
-"""IoU of masks from which a part is an object [1]; method notes 5."""
+"""Minimum IoU of masks at which a segment is an object [1], as in docs/method.md, section V."""
 COUNTED = ("found", "invented", "split", "merged")
 SHARE = 0.2
-"""A part that holds this share of an object's readings is a piece of it [1]."""
+"""A segment that holds this share of an object's readings is a piece of it [1]."""
 
 
 @dataclass(frozen=True)
 class Args(Gated):
-    """Segment views and compare with true masks."""
+    """Segment views, and compare the segments with true masks."""
 
     sources: Annotated[tuple[str, ...], tyro.conf.Positional] = BUILT_IN
     """Scene folders, names of built-in scenes, or BOP folders."""
     views: int = 4
-    """Views of each scene; a recording has its own."""
+    """Number of views of each scene; a recording has its own."""
     noise: NoiseModel = "carmine"
     """Noise of the simulated camera."""
     seed: int = 0
@@ -66,13 +66,13 @@ class Args(Gated):
 
 
 def views_of(source: str, args: Args, config: Config) -> Iterator[View]:
-    """The views of a source, with true labels."""
+    """Yield the views of a source, with true labels."""
     if is_recording(source):
         yield from read_recording(source)
         return
     opened = open_source(source, config, noise=args.noise, segmentation="labels", seed=args.seed)
     if opened.truth is None:
-        raise CaryatidError(f"{source}: has no truth to score against")
+        raise CaryatidError(f"{source}: has no ground truth to score against")
     sphere = ViewSphere.around(np.array([0.0, 0.0, opened.truth.table_top]), config.active)
     found = opened.robot.candidates(sphere)
     first = opened.robot.T_world_camera
@@ -82,11 +82,11 @@ def views_of(source: str, args: Args, config: Config) -> Iterator[View]:
 
 
 def compare(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> dict[str, int]:
-    """Count true objects and parts, and of them those found, invented, split and merged.
+    """Count true objects and segments, and how many are found, invented, split and merged.
 
     Args:
-        labels: Parts of the pixels with a reading (N,).
-        truth: Their objects (N,).
+        labels: Segment of each pixel with a reading (N,).
+        truth: True object of each of these pixels (N,).
     """
     counts = pd.crosstab(labels, truth).drop(index=0, errors="ignore")
     part_sizes = counts.sum(axis=1).to_numpy()
@@ -110,7 +110,7 @@ def compare(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> dict[str, in
 
 
 def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
-    """Segment the views of one source: a row for each."""
+    """Segment the views of one source; return one row per view."""
     source, args = task
     config = read_settings(None, args.set)
     rows = []
@@ -127,13 +127,13 @@ def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
 
 
 def shares(rows: pd.DataFrame) -> dict[str, float]:
-    """Shares found, split and merged of the true objects, and invented of the parts."""
+    """Return the shares of true objects found, split and merged, and the share of segments invented."""
     sums = rows.sum(numeric_only=True)
     return {name: sums[name] / max(sums["parts" if name == "invented" else "true"], 1) for name in COUNTED}
 
 
 def measures(rows: pd.DataFrame) -> list[Measure]:
-    """The shares of each family of scenes."""
+    """Return the shares of each family of scenes."""
     return [
         Measure(f"{name}.{field}", value, "1", "higher" if field == "found" else "lower", 0.02)
         for name, group in rows.groupby(rows["source"].map(family))

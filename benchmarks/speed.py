@@ -1,4 +1,4 @@
-"""What `bench.py` measures of the loop: the turn and its stages, a decision, the map, start-up and growth."""
+"""Measure the loop for `bench.py`: a step (`turn`), its stages, a decision, the map, start-up and growth."""
 
 from __future__ import annotations
 
@@ -52,16 +52,16 @@ from caryatid.simulation.world import (
 )
 
 HEAP, VIEWS = "pile-10-1", 8
-"""Scene of ten objects, and views of it: the first one and the seven a median is taken of."""
+"""Scene of ten objects, and number of its views: the first one, and seven for the median."""
 ELEVATION, GOLDEN_ANGLE = np.deg2rad(38.0), np.pi * (3.0 - np.sqrt(5.0))
-"""Elevation of the views and azimuth between consecutive ones [rad]: spreads any number all around."""
+"""Elevation of the views, and azimuth between consecutive ones [rad]; it spreads them all around."""
 PITCH = 0.11
-"""Between places on the table of many objects [m]: a free gap between objects of 4 to 7 cm."""
+"""Distance between places on the table of many objects [m]: it leaves gaps between objects of 4 to 7 cm."""
 SEGMENTATIONS: tuple[SegmentationMethod, ...] = ("auto", "labels")
 SEGMENTS = {"auto": "automatic segments", "labels": "labels given"}
 TARGETS = {"turn.auto": 0.5, "turn.labels": 0.5, "perceive.labels": 0.25}
 OBJECTS, POINTS = 36, 30
-"""Objects on the table; of so many are left that a decision is about no more points of interest [1]."""
+"""Objects on the table; some are dropped until a decision has at most this many points of interest [1]."""
 AXES = {
     "points": "pixels of the image", "objects": "objects on the table", "views": "views seen",
     "voxels": "voxels of the map",
@@ -81,12 +81,12 @@ for segmentation in ("auto", "labels"):
         simulation.robot.move_to(ct.next_best_view(scene, simulation.robot).T_world_camera)
 print(time.perf_counter() - started)
 """
-"""What someone does first, in a new process; prints its duration [s]."""
+"""A user's first steps, in a new process; prints their duration [s]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Recording:
-    """Views of a scene (V), where the camera truly was (V, 4, 4), and a robot that can be there."""
+    """Views of a scene (V), their true camera poses (V, 4, 4), and a robot that can reach these."""
 
     config: Config
     poses: Array
@@ -95,7 +95,7 @@ class Recording:
 
 
 def record(scene: SimulatedScene, count: int = VIEWS, sensor: SensorConfig | None = None) -> Recording:
-    """Take views from all around, with the noise and the registration error of the simulated camera."""
+    """Capture views from all around, with the simulated camera's noise and registration error."""
     config = replace(Config(), sensor=sensor or SensorConfig())
     simulation = make_simulation(scene, config, noise="carmine", seed=0)
     poses = _ring(scene, simulation.robot, config, count)
@@ -104,7 +104,7 @@ def record(scene: SimulatedScene, count: int = VIEWS, sensor: SensorConfig | Non
 
 
 def _ring(scene: SimulatedScene, robot: Robot, config: Config, count: int) -> Array:
-    """Poses (V, 4, 4) around the table that the robot reaches, the first where it stands."""
+    """Return reachable poses (V, 4, 4) around the table; the first is the robot's current one."""
     sphere = ViewSphere.around(table_centre(scene), config.active)
     reached = robot.candidates(sphere)
     first = sphere.direction_of(robot.T_world_camera)
@@ -116,7 +116,7 @@ def _ring(scene: SimulatedScene, robot: Robot, config: Config, count: int) -> Ar
 
 
 def table_of(count: int, size: tuple[float, float] = (1.2, 1.2), pitch: float = PITCH) -> SimulatedScene:
-    """A table [m] with so many boxes, cylinders and balls in rows, every third one on top of another."""
+    """Build a table [m] with boxes, cylinders and balls in rows, a third of them on top of others."""
     rng = np.random.default_rng([count, 0])
     stacked = count // 3
     rows = int(np.ceil(np.sqrt((count - stacked) * size[0] / size[1])))
@@ -130,7 +130,7 @@ def table_of(count: int, size: tuple[float, float] = (1.2, 1.2), pitch: float = 
 
 
 def _standing(xy: Array, height: float, rng: np.random.Generator, *, flat: bool = False) -> Shape:
-    """A shape that stands over the table at a height [m]; with `flat` one that others can stand on."""
+    """Draw a shape that stands at a height above the table [m]; with `flat`, one that others can stand on."""
     turn = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
     kind = rng.choice(["box", "cylinder"] if flat else ["box", "cylinder", "sphere"])
     size = rng.uniform(0.04, 0.07, 3)
@@ -142,16 +142,16 @@ def _standing(xy: Array, height: float, rng: np.random.Generator, *, flat: bool 
 
 
 Laps = dict[str, float]
-"""What a turn and its parts took [s]."""
+"""Durations of a step and its parts [s]."""
 
 
 def fresh(view: View, *, labels: bool = True) -> View:
-    """The view as its camera's images make it: nothing is worked out of it yet."""
+    """Copy a view as it comes from the camera: nothing is computed from it yet."""
     return replace(view, labels=view.labels if labels else None)
 
 
 class Episode:
-    """A scene model that is shown a recording's views one by one, each as its images."""
+    """A scene model that gets a recording's views one by one, fresh from the camera."""
 
     def __init__(self, recording: Recording, segmentation: SegmentationMethod) -> None:
         self.scene = Scene(recording.config, segmentation=segmentation)
@@ -159,7 +159,7 @@ class Episode:
         self._visited: list[Array] = []
 
     def look(self, T_world_camera: Array, view: View) -> Laps:
-        """Take in a view and choose the next one; what `turn`, `perceive`, `plan` and each stage took [s]."""
+        """Add a view and choose the next one; return the durations of the step, its parts and stages [s]."""
         time.sleep(PAUSE)
         self._robot.move_to(T_world_camera)
         started = time.perf_counter()
@@ -174,9 +174,9 @@ class Episode:
 
 
 def measure_turns(effort: Effort) -> list[Row]:
-    """Rows of the turn, of perceiving and of the stages: ours and Open3D's chain take turns view by view.
+    """Measure the step, perception and the stages; ours and Open3D's chain alternate view by view.
 
-    After a warm-up all views are gone through, and then the first one alone, for its median.
+    After a warm-up, some passes cover all views; the others cover only the first view, for its median.
     """
     recording = record(load_scene(HEAP))
     chains, missing = [], ""
@@ -213,7 +213,7 @@ def measure_turns(effort: Effort) -> list[Row]:
 
 
 def _stages(recording: Recording, later: dict[str, list[Laps]], effort: Effort) -> list[Row]:
-    """Rows of the stages: those that can be called by themselves, on the first view, and the turns' own."""
+    """Measure the stages: those that can be called alone, on the first view, and those within steps."""
     config, view = recording.config, recording.views[0]
     points, normals, pixels = oriented_points(view, config.cloud)
     assert view.labels is not None
@@ -230,7 +230,7 @@ def _stages(recording: Recording, later: dict[str, list[Laps]], effort: Effort) 
         rng = np.random.default_rng(0)
         return segment(fresh(view, labels=False), found, config.segmentation, config.cloud, config.fit, rng)
 
-    # Depth in; place, normal and pixel of each point out; six running sums and three unknowns a pixel.
+    # Depth in; position, normal and pixel of each point out; six running sums and three unknowns per pixel.
     size = view.depth.size
     of_points = (4.0 * size + 56.0 * len(points), 64.0 * size)
     alone: dict[str, tuple[str, Callable[[], object], Limit]] = {
@@ -245,7 +245,7 @@ def _stages(recording: Recording, later: dict[str, list[Laps]], effort: Effort) 
         for name, (what, call, limit) in alone.items()
     ]
     valid, objects = float(view.valid.sum()), len(np.unique(view.labels)) - 1
-    shape_numbers = 22  # pose and size of a fitted shape, and how sure each is
+    shape_numbers = 22  # pose and size of a fitted shape, and their uncertainties
     voxels = float(np.prod(np.ceil(np.array(config.voxels.extent) / config.voxels.size)))
     limits: dict[str, Limit] = {
         "segment": (4.0 * size + 56.0 * valid, 64.0 * size),
@@ -265,17 +265,17 @@ def _stages(recording: Recording, later: dict[str, list[Laps]], effort: Effort) 
 
 
 def fit_limit(points: int) -> Limit:
-    """Of a fit: three shapes judged once (20 operations a point), one least-squares step of nine numbers."""
+    """Limit of a fit: score three shapes at 20 operations per point, one least-squares step of 9 numbers."""
     return 48.0 * points, points * (20.0 * 3 + 20.0 + 2.0 * 9 + 9 * 10.0)
 
 
 def plan_limit(voxels: float, candidates: int, config: Config) -> Limit:
-    """Of a decision: states of the map and poses once; each sample turned to each look, 20 operations."""
+    """Limit of a decision: read map and poses once; rotate each sample to each look, at 20 operations."""
     return voxels + 152.0 * candidates, 20.0 * SURFACE_SAMPLES * config.active.look_directions
 
 
 def measure_decision(effort: Effort) -> list[Row]:
-    """Rows of one decision over the view sphere: the default planner against the field's volumetric one."""
+    """Measure one decision over the view sphere: the default planner against the field's volumetric one."""
     recording = record(table_of(OBJECTS), 2)
     scene, robot, config = Scene(recording.config, segmentation="labels"), recording.robot, recording.config
     for view in recording.views:
@@ -286,7 +286,7 @@ def measure_decision(effort: Effort) -> list[Row]:
     robot.move_to(recording.poses[-1])
     visited = sphere.direction_of(recording.poses)
     objects, points = list(scene.graph.objects), POINTS + 1
-    while points > POINTS:  # an object has as many as it has supporters, and at least one
+    while points > POINTS:  # an object has one per supporter, and at least one
         objects.pop()
         ids = {o.id for o in objects}
         graph = SupportGraph(tuple(objects), tuple(s for s in scene.graph.supports if ids.issuperset(s.pair)))
@@ -331,7 +331,7 @@ def measure_decision(effort: Effort) -> list[Row]:
 
 
 def measure_map(effort: Effort) -> list[Row]:
-    """Row of the map's update with a VGA view against a pass that only unprojects and hashes its points."""
+    """Measure a map update with a VGA view against a pass that only unprojects and hashes its points."""
     recording = record(load_scene(HEAP), 3)
     config, view = recording.config, recording.views[-1]
     centre_world = recording.poses[0][:3, 3] + config.active.sphere_radius * recording.poses[0][:3, 2]
@@ -354,7 +354,7 @@ def measure_map(effort: Effort) -> list[Row]:
 
 
 def measure_start(effort: Effort) -> list[Row]:
-    """Rows of start-up, each in a process of its own; the first run of each is the warm-up."""
+    """Measure start-up, each run in its own process; the first run of each kind is the warm-up."""
 
     def run(*arguments: str, **environment: str) -> str:
         command, known = [sys.executable, *arguments], os.environ | environment
@@ -379,7 +379,7 @@ def measure_start(effort: Effort) -> list[Row]:
 
 
 def measure_growth(axis: str, effort: Effort) -> list[Row]:
-    """Rows of the exponents the turn grows with along one of `AXES`, and of the memory many views take."""
+    """Measure the exponents with which a step's time grows along one of `AXES`, and memory of many views."""
     if axis == "views":
         return [row for name in SEGMENTATIONS for row in _over_views(name, effort.views)]
     recordings, seen = [], effort.runs + 1
@@ -409,7 +409,7 @@ def measure_growth(axis: str, effort: Effort) -> list[Row]:
 
 
 def _exponent(axis: str, segmentation: str, sizes: Sequence[float], turns: Sequence[float]) -> Row:
-    """Exponent of the size the turn grows with: least squares on both logarithms."""
+    """Fit the exponent with which a step's time grows with size: least squares on the logarithms of both."""
     whole, upper = (
         np.polyfit(np.log(sizes[k:]), np.log(turns[k:]), 1)[0] for k in (0, (len(sizes) - 1) // 2)
     )
@@ -421,7 +421,7 @@ def _exponent(axis: str, segmentation: str, sizes: Sequence[float], turns: Seque
 
 
 def _over_views(segmentation: SegmentationMethod, views: int) -> list[Row]:
-    """Rows of growth with the views seen, from the tenth on, and of peak memory, in a process of its own."""
+    """Measure growth with the number of views, from the tenth on, and peak memory, in a separate process."""
     (turns, held), peak = _alone(_many_views, segmentation, views)
     edges = np.unique(np.geomspace(min(10, len(turns) // 2), len(turns) + 1, 13).astype(int))
     bins = [range(a, b) for a, b in pairwise(edges)]
@@ -433,16 +433,16 @@ def _over_views(segmentation: SegmentationMethod, views: int) -> list[Row]:
 
 
 def _alone(call: Callable[..., T], *arguments: object) -> tuple[T, float]:
-    """Result of a call in a process of its own, and the peak memory of that process [MB]."""
+    """Run a call in a separate process; return its result and the peak memory of that process [MB]."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         result = pool.submit(call, *arguments).result()
-        # Unlike getrusage's, this peak is not that of the process that started this one.
+        # Unlike getrusage's, this peak excludes the parent process.
         status = pool.submit(Path("/proc/self/status").read_text, "ascii").result()
     return result, _peak(status)
 
 
 def _many_views(segmentation: SegmentationMethod, views: int) -> tuple[list[float], list[float]]:
-    """Whole turn of each of many views [s], and the memory held after it [MB]."""
+    """Return the duration of each of many steps [s], and the memory held after it [MB]."""
     scene = load_scene(HEAP)
     episode, process = Episode(record(scene, 1), segmentation), psutil.Process()
     turns: list[float] = []
@@ -455,7 +455,7 @@ def _many_views(segmentation: SegmentationMethod, views: int) -> tuple[list[floa
 
 
 def measure_large(effort: Effort) -> list[Row]:
-    """Rows of a table of 3 × 2 m with very many objects: a turn, peak memory, and a removal order."""
+    """Measure a table of 3 × 2 m with very many objects: a step, peak memory, and a removal order."""
     rows = []
     for name in SEGMENTATIONS:
         turns, peak, ordering, found = _alone(_many_objects, name, effort.crowd)[0]
@@ -471,7 +471,7 @@ def measure_large(effort: Effort) -> list[Row]:
 
 
 def _many_objects(segmentation: SegmentationMethod, count: int) -> tuple[list[float], float, float, int]:
-    """Whole turns [s], peak memory [MB], a removal order with labels [s], and the number of objects found."""
+    """Return times of steps [s], peak memory [MB], time of a removal order with labels [s], objects found."""
     size, middle = (3.0, 2.0), np.array([0.0, 0.0, TABLE_HEIGHT])
     config = replace(Config(), voxels=replace(Config().voxels, extent=(3.2, 2.2, 0.5)))
     simulation = make_simulation(table_of(count, size, 0.17), config, noise="carmine", seed=0)
@@ -491,15 +491,15 @@ def _many_objects(segmentation: SegmentationMethod, count: int) -> tuple[list[fl
 
 
 def _peak(status: str) -> float:
-    """Peak memory [MB] of a process by its status file."""
+    """Read the peak memory [MB] of a process from the text of its status file."""
     return int(status.split("VmHWM:")[1].split()[0]) / 1024.0
 
 
 def measure_real(effort: Effort) -> list[Row]:
-    """Rows of real frames, the first view of each on one thread, and of ten views of the slowest."""
+    """Measure real frames: the first view of each, on one thread, and ten views of the slowest."""
     folders = [f for f in sorted(effort.real.glob("*/")) if "-masks" not in f.name]
     if not folders:
-        return [Row("perceive.real", "real frames", None, target=1000.0, note=f"{effort.real} is absent")]
+        return [Row("perceive.real", "real frames", None, target=1000.0, note=f"{effort.real} is missing")]
     took, _ = _alone(_real_views, folders[:1] + folders, 1)
     seconds, slowest = max((seconds, folder) for folder, seconds in took.items())
     _, peak = _alone(_real_views, [slowest], 10)
@@ -512,7 +512,7 @@ def measure_real(effort: Effort) -> list[Row]:
 
 
 def _real_views(folders: Sequence[Path], views: int) -> dict[Path, float]:
-    """CPU time [s] of the last of so many views, all the same, of each recording that shows its surface."""
+    """Add the same view several times; return the CPU time [s] of the last, per recording with a surface."""
     numba.set_num_threads(1)
     took = {}
     for folder in folders:
@@ -521,6 +521,6 @@ def _real_views(folders: Sequence[Path], views: int) -> dict[Path, float]:
             view, started = read_recording(folder)[0], time.process_time()
             # A single image has no pose until a surface gives it one.
             scene.update(view if scene.T_world_camera is None else view.with_pose(scene.T_world_camera))
-            if scene.views:  # it is not kept for later
+            if scene.views:  # otherwise the view is kept for later
                 took[folder] = time.process_time() - started
     return took

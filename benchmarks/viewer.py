@@ -1,4 +1,4 @@
-"""What the viewer takes: the time until a view is shown, CPU time of the loop's process, and memory."""
+"""Measure the viewer: the time until a view is shown, CPU time of the loop's process, and memory."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from caryatid.simulation.setup import make_simulation
 from caryatid.viewer.page import Page, PageProcess
 
 POINTS = 300_000
-"""Size of the cloud that is shown."""
+"""Number of points of the cloud that is shown."""
 SHOWN, COST, GROWTH = 150.0, 2.0, 1.0
-"""Asked for: time until a view is shown [ms], share of the loop's CPU time [%], memory of a view [MB]."""
+"""Targets: time until a view is shown [ms], share of the loop's CPU time [%], memory per view [MB]."""
 
 
 def measure_viewer(effort: Effort) -> list[Row]:
@@ -74,19 +74,19 @@ def measure_viewer(effort: Effort) -> list[Row]:
 
 
 def _enlarged(cloud: Cloud) -> Cloud:
-    """A cloud of `POINTS` points: those of another, again and again, each time a little elsewhere."""
+    """Make a cloud of `POINTS` points: those of another, repeated with small random offsets."""
     large = cloud.select(np.arange(POINTS) % len(cloud))
     noise = np.random.default_rng(0).normal(0.0, 0.002, (POINTS, 3))
     return replace(large, points_world=large.points_world + noise)
 
 
 def _numbered(step: Step, index: int) -> Step:
-    """The step as if it were that of another view, so that all of it is sent again."""
+    """Copy a step as if it were that of another view, so that all of it is sent again."""
     return replace(step, index=index, graph=replace(step.graph), cloud=replace(step.cloud))
 
 
 def _until_shown(page: Page, step: Step, browser: Connection) -> float:
-    """Time [s] until a browser has the 3D scene and the text of a step that is added."""
+    """Add a step; return the time [s] until a browser has its 3D scene and its text."""
     page.wait()
     time.sleep(0.2)
     began, text = time.perf_counter(), f"View {step.index + 1} of {step.index + 1}<".encode()
@@ -97,6 +97,6 @@ def _until_shown(page: Page, step: Step, browser: Connection) -> float:
 
 
 def _texts(message: str | bytes) -> bytes:
-    """What one of viser's messages says, without its arrays: zstd between a header and the arrays."""
+    """Return the text of a viser message, without its arrays: zstd data between a header and the arrays."""
     assert isinstance(message, bytes)
     return ZstdDecompressor().decompress(message[16 : 16 + int.from_bytes(message[8:16], "little")])

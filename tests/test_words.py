@@ -12,7 +12,8 @@ TEXTS = [
     *(ROOT / "src").rglob("*.py"), *(ROOT / "examples").rglob("*.py"),
     *(ROOT / "ros").rglob("*.*"),
     *(page for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")) if "_build" not in page.parts),
-    *(ROOT / ".github").rglob("*.yml"),
+    *(ROOT / ".github").rglob("*.yml"), *(ROOT / "benchmarks").glob("*.py"), *(ROOT / "tools").glob("*.py"),
+    *(p for p in (ROOT / "docs").rglob("*.py") if not {"_build", "gallery"} & {*p.parts}), ROOT / "Makefile",
 ]  # fmt: skip
 COMPARED = "longer|more|smaller|larger|higher|wider|later|surer|better|shorter|difference|inhibition|IG"
 """Words that may follow `is no`."""

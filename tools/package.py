@@ -1,4 +1,4 @@
-"""Build wheel and sdist, and try both where nothing else is installed, with each Python there is."""
+"""Build wheel and sdist, and try them in clean environments: the wheel in each Python, the sdist in one."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 VERSIONS = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text())
-"""Pythons the classifiers promise."""
+"""Python versions in the classifiers."""
 
 
 def find_python(wanted: str) -> Path | None:
-    """Find an interpreter of a version, such as 3.12: this one, on the PATH, or of pyenv."""
+    """Find an interpreter of a version such as 3.12: this one, or one on the PATH or in pyenv."""
     if sys.version.startswith(f"{wanted}."):
         return Path(sys.executable)
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
@@ -29,7 +29,7 @@ def find_python(wanted: str) -> Path | None:
 
 
 def numbers(python: Path) -> list[int]:
-    """Numbers in the version of a Python of pyenv."""
+    """Return the numbers in the version of a pyenv interpreter."""
     return [int(digits) for digits in re.findall(r"\d+", python.parts[-3])]
 
 
@@ -49,7 +49,7 @@ def try_out(python: Path, distribution: Path, folder: Path) -> dict[str, object]
 
 
 def run(*words: str, cwd: Path | None = None) -> str:
-    """Run a program; its output where it does well, the end of it all where it does not."""
+    """Run a program and return its output; if it fails, exit with the end of its output."""
     own = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "NUMBA_CACHE_DIR")
     environment = {name: value for name, value in os.environ.items() if name not in own}
     done = subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
@@ -59,10 +59,10 @@ def run(*words: str, cwd: Path | None = None) -> str:
 
 
 def main() -> None:
-    """Build, install and try; say what came of it, a line for each Python."""
+    """Build, install and try; print one line per Python and distribution."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="where wheel and sdist go")
-    parser.add_argument("--python", nargs="*", default=VERSIONS, help="only these versions, say 3.12")
+    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder for wheel and sdist")
+    parser.add_argument("--python", nargs="*", default=VERSIONS, help="try only these versions, e.g. 3.12")
     options = parser.parse_args()
     shutil.rmtree(options.out, ignore_errors=True)
     run(sys.executable, "-m", "build", "--outdir", str(options.out), str(ROOT))
@@ -74,7 +74,7 @@ def main() -> None:
     distributions = [wheel, sdist]
     for wanted, python in pythons.items():
         if python is None:
-            print(f"Python {wanted}: not on this machine, not tried", flush=True)
+            print(f"Python {wanted}: not installed, skipped", flush=True)
             continue
         for distribution in distributions:
             with tempfile.TemporaryDirectory(prefix="caryatid-") as folder:
@@ -82,7 +82,7 @@ def main() -> None:
             print(f"Python {wanted}, {distribution.suffix.lstrip('.')}: {json.dumps(told)}", flush=True)
         distributions = [wheel]
     if not any(pythons.values()):
-        sys.exit("no Python was found that the classifiers promise")
+        sys.exit("none of these Python versions is installed")
 
 
 if __name__ == "__main__":

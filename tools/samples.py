@@ -1,4 +1,4 @@
-"""Write the samples in the package: a recording and a cloud of the simulated scene `clutter`."""
+"""Write the package's samples: a recording and a point cloud of the simulated scene `clutter`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from caryatid.simulation import GroundTruth, SimulatedCamera, ground_truth, load
 
 SAMPLES = Path(__file__).parents[1] / "src/caryatid/samples"
 VIEWS = 8
-"""Views all around the table, 40° up and 1.2 m from its middle, where a robot's camera could be."""
+"""Number of views all around the table, at 40° elevation and 1.2 m from its centre, as a robot could take."""
 SENSOR = SensorConfig(width=320, height=240, focal=262.5)
 """Half the resolution of a Carmine."""
 THINNED = 0.007
@@ -26,7 +26,7 @@ THINNED = 0.007
 
 
 def main() -> None:
-    """Write both, and say how large they are."""
+    """Write both samples, and print their size."""
     shutil.rmtree(SAMPLES, ignore_errors=True)
     scene = load_scene("clutter")
     camera = SimulatedCamera(scene, "carmine", rng=np.random.default_rng(0), sensor=SENSOR)
@@ -47,7 +47,7 @@ def main() -> None:
     model = ct.Scene(replace(config, cloud=replace(config.cloud, voxel=THINNED)))
     for view in read_recording(folder):
         model.update(view)
-    cloud = model.cloud.moved(transforms.invert(views[0].pose))  # a file of a cloud is in its sensor's frame
+    cloud = model.cloud.moved(transforms.invert(views[0].pose))  # cloud files are in the sensor's frame
     assert cloud.labels is not None
     labels = np.where(cloud.labels < SUPPORT_LABEL, cloud.labels, 0)
     # Half of the points on objects and a third of those on the table are enough.

@@ -1,4 +1,4 @@
-"""Whether an installed caryatid works without extras: run by its Python, in an empty folder."""
+"""Check that an installed caryatid works without extras; run this with its Python, in an empty folder."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ header = "ply\\nformat ascii 1.0\\nelement vertex %d\\n" % len(points)
 header += "".join(f"property float {axis}\\n" for axis in "xyz") + "end_header"
 np.savetxt("table.ply", points, "%.5f", header=header, comments="")
 """
-"""Writes what a depth camera sees of a tower as `table.ply`."""
+"""Writes a depth camera's view of a tower to `table.ply`."""
 
 
 def caryatid(*words: str) -> str:
-    """Run the command that was installed, as a shell would; what it says."""
+    """Run the installed command as a shell would, and return its output."""
     command = Path(sysconfig.get_path("scripts")) / "caryatid"
     done = subprocess.run([command, *words], capture_output=True, text=True, check=False)
     if done.returncode != 0 or "Traceback" in done.stderr:
@@ -36,13 +36,13 @@ def caryatid(*words: str) -> str:
 
 
 def check(true: bool, what: str) -> None:
-    """End with what is wrong."""
+    """Exit with a message unless a condition is true."""
     if not true:
         sys.exit(what)
 
 
 def main() -> None:
-    """Try everything, and write how long it took as JSON."""
+    """Try everything, and print the durations as JSON."""
     times: dict[str, float] = {}
     begun = time.monotonic()
 
@@ -52,27 +52,27 @@ def main() -> None:
     import caryatid as package
 
     home = Path(package.__file__).parent
-    check(home.is_relative_to(Path(sys.prefix).resolve()), f"caryatid of {home} was imported")
-    check(all(getattr(package, name) is not None for name in package.__all__), "a name is missing")
+    check(home.is_relative_to(Path(sys.prefix).resolve()), f"caryatid was imported from {home}")
+    check(all(getattr(package, name) is not None for name in package.__all__), "a public name is missing")
     check((home / "py.typed").exists(), "py.typed is missing")
     told = caryatid("--version")
     check(told == f"caryatid {version('caryatid')}\n", f"--version says {told}")
-    check("explore" in caryatid("--help"), "--help does not name the commands")
+    check("explore" in caryatid("--help"), "--help does not list the commands")
     lap("start")
     caryatid("demo", "--scene", "tower", "--views", "2", "--out", "run")
     check(len(Path("run/report.html").read_text()) > 10_000, "the report is empty")
     lap("demo")
     subprocess.run([sys.executable, "-c", CLOUD], check=True)
     graph = json.loads(caryatid("extract", "table.ply", "--out", "cloud", "--json"))["graph"]
-    check(len(graph["objects"]) > 3 and len(graph["supports"]) > 2, "too little was found in a cloud")
+    check(len(graph["objects"]) > 3 and len(graph["supports"]) > 2, "too little was found in the cloud")
     lap("extract")
     order = json.loads(caryatid("order", "run", "--set", "rehearsal.draws=2", "--json"))
-    check(len(order["steps"]) > 0, "there is no order")
+    check(len(order["steps"]) > 0, "no removal order was found")
     for file in ("scene.xml", "scene.urdf", "scene.glb", "scene.graphml", "scene.dot"):
         caryatid("export", "run", "--out", file)
         check(Path(file).stat().st_size > 100, f"{file} is empty")
     caryatid("session", "new", "table")
-    check("complete" in caryatid("completion", "bash"), "there is no completion")
+    check("complete" in caryatid("completion", "bash"), "shell completion is missing")
     print(json.dumps({"python": sys.version.split()[0], "seconds": times}))
 
 

@@ -5,8 +5,8 @@ python tools/train_affinities.py train FOLDER [--minutes M] [--out FILE]        
 
 Scenes hold random objects of one to a dozen convex parts: tools, bottles, mugs, bowls, toys, boxes. They fall
 onto a table, onto or into a larger object, or stand in rows. They are plain, printed or painted part by part.
-Images are noise-free; each training crop gets noise, gaps, mixed pixels and colours of its own. 1,800 such
-scenes and two hours on two cores are enough.
+Images are noise-free; each training crop gets its own noise, gaps, mixed pixels and colours. 1,800 scenes and
+two hours of training on two cores are enough.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def ring(radius: float, height: float, corners: int) -> Array:
 
 
 def turned(rings: Sequence[tuple[float, float]], corners: int = 14) -> list[Part]:
-    """A body of revolution through rings of a radius and a height."""
+    """Make a body of revolution through rings, given as pairs of radius and height."""
     return [hull(np.concatenate([ring(*a, corners), ring(*b, corners)])) for a, b in pairwise(rings)]
 
 
@@ -77,7 +77,7 @@ def wall(low: tuple[float, float], high: tuple[float, float], thickness: float) 
 
 
 def chain(points: Array, radii: Any) -> list[Part]:
-    """Capsules from point to point."""
+    """Connect consecutive points by capsules."""
     parts = []
     for (p, q), radius in zip(pairwise(points), radii, strict=True):
         R = Rotation.align_vectors([q - p], [[0.0, 0.0, 1.0]])[0].as_matrix()
@@ -106,7 +106,7 @@ def carton(rng: Rng) -> list[Part]:
 
 
 def bottle(rng: Rng) -> list[Part]:
-    """A body with shoulders; some have a trigger or a handle."""
+    """Make a body with shoulders; some bottles have a trigger or a handle."""
     radius, height, steps = rng.uniform(0.018, 0.05), rng.uniform(0.08, 0.26), int(rng.integers(3, 6))
     heights = np.sort([0.0, *rng.uniform(0.2, 0.95, steps - 1), 1.0]) * height + 1e-3 * np.arange(steps + 1)
     radii = radius * np.concatenate([[1.0, 1.0], np.cumprod(rng.uniform(0.45, 1.05, steps - 1))])
@@ -172,7 +172,7 @@ def drill(rng: Rng) -> list[Part]:
 
 
 def tool(rng: Rng) -> list[Part]:
-    """A handle with heads: hammers, brushes, clamps."""
+    """Make a handle with heads: hammers, brushes, clamps."""
     length, width = rng.uniform(0.05, 0.13), rng.uniform(0.006, 0.016)
     parts = [block((length, width, rng.uniform(0.005, 0.014)))]
     if rng.random() < 0.5:
@@ -188,7 +188,7 @@ def tool(rng: Rng) -> list[Part]:
 
 
 def toy(rng: Rng) -> list[Part]:
-    """Ellipsoids, boxes and cylinders that grow out of each other."""
+    """Make ellipsoids, boxes and cylinders that grow out of each other."""
     parts, centres, radii = [], [np.zeros(3)], [rng.uniform(0.02, 0.045)]
     for k in range(int(rng.integers(2, 6))):
         if k:
@@ -209,7 +209,7 @@ def stone(rng: Rng) -> list[Part]:
 
 
 def profile(rng: Rng) -> list[Part]:
-    """L, T, U and stairs."""
+    """Make L, T and U profiles, and stairs."""
     parts, at, width = [], 0.0, rng.uniform(0.015, 0.04)
     for _ in range(int(rng.integers(2, 4))):
         half, height = rng.uniform((0.012, 0.01), (0.04, 0.06))
@@ -247,7 +247,7 @@ def drawn(rng: Rng, makers: dict[Maker, float]) -> list[Part]:
 
 
 def bodies(rng: Rng) -> Iterator[tuple[list[Part], float, Array, Rotation]]:
-    """Parts, scale, position and orientation of each object before it falls."""
+    """Yield the parts, scale, position and orientation of each object before it falls."""
     kind, count = rng.random(), int(rng.integers(1, 17))
     makers, level = OBJECTS, rng.random() < 0.25
     spread = rng.uniform(0.06, 0.16) * np.sqrt(count) / 2.0
@@ -286,7 +286,7 @@ def bodies(rng: Rng) -> Iterator[tuple[list[Part], float, Array, Rotation]]:
 
 
 def settled(rng: Rng) -> tuple[Any, Any, NDArray[np.int32]]:
-    """A table with fallen objects: model, state, and label of each geom."""
+    """Drop objects onto a table; return the model, its state, and the label of each geom."""
     spec = mujoco.MjSpec()
     spec.option.timestep = 0.004
     spec.worldbody.add_geom(
@@ -317,7 +317,7 @@ def settled(rng: Rng) -> tuple[Any, Any, NDArray[np.int32]]:
         mujoco.mj_step(model, data)
         data.qvel *= 0.995
     mujoco.mj_forward(model, data)
-    # Static geoms belong to body 0; what fell off the table is background.
+    # Static geoms belong to body 0; objects that fell off the table are background.
     labels = model.geom_bodyid * (data.xpos[model.geom_bodyid, 2] > -0.03)
     return model, data, labels.astype(np.int32)
 
@@ -326,14 +326,14 @@ def settled(rng: Rng) -> tuple[Any, Any, NDArray[np.int32]]:
 
 
 def palette(rng: Rng, count: int) -> Array:
-    """Random colours (N, 3) from 0 to 1, many of them pale or dark."""
+    """Draw random colours (N, 3) from 0 to 1, many of them pale or dark."""
     colours = rng.random((count, 3)) ** rng.uniform(0.5, 2.0)
     grey = colours.mean(axis=1, keepdims=True)
     return grey + (colours - grey) * rng.uniform(0.0, 1.0, (count, 1))
 
 
 def painted(rng: Rng, geoms: Sequence[int], model: Any) -> Callable[[Array, Array], Array]:
-    """How an object looks: colours (N, 3) at points (N, 3) of its own frame, on geoms (N,)."""
+    """Draw an object's look: a function from points (N, 3) in its frame, on geoms (N,), to colours (N, 3)."""
     kind, reach = rng.random(), rng.uniform(0.02, 0.12)
     colours = palette(rng, 5)
     part = np.zeros(model.ngeom, dtype=np.intp)
@@ -356,7 +356,7 @@ def painted(rng: Rng, geoms: Sequence[int], model: Any) -> Callable[[Array, Arra
                 inside &= np.sin(2.0 * np.pi * (points @ lines)) > 0.2
             shown[inside] = colours[number]
         for g in geoms if edge else ():
-            if model.geom_type[g] == BOX:  # edges are dark, or worn
+            if model.geom_type[g] == BOX:  # darken its edges
                 own = on == g
                 R = Rotation.from_quat(model.geom_quat[g], scalar_first=True).as_matrix()
                 at = (points[own] - model.geom_pos[g]) @ R
@@ -369,7 +369,7 @@ def painted(rng: Rng, geoms: Sequence[int], model: Any) -> Callable[[Array, Arra
 
 
 def ground(rng: Rng) -> Callable[[Array, Array], Array]:
-    """How a table looks: plain, in boards, checked or mottled."""
+    """Draw a table's look: plain, planked, checkered or mottled."""
     colours, kind = palette(rng, 2), int(rng.integers(4))
     colours, mixed = 0.6 * colours + 0.4 * colours.mean(), rng.uniform(0.1, 1.0)
     turn, size = Rotation.from_euler("z", rng.uniform(0.0, np.pi)).as_matrix(), rng.uniform(0.02, 0.2)
@@ -391,7 +391,7 @@ def ground(rng: Rng) -> Callable[[Array, Array], Array]:
 
 
 def coloured(model: Any, data: Any, points: Array, normals: Array, on: Any, paint: Any, rng: Rng) -> Any:
-    """Colours (N, 3) uint8 of points of geoms (N,), lit by one lamp, with its shadows."""
+    """Compute colours (N, 3) uint8 of points on geoms (N,), lit by one lamp that casts shadows."""
     albedo = np.full((len(points), 3), 0.5)
     body = np.where(on >= 0, model.geom_bodyid[on], -1)
     for number, look in paint.items():
@@ -415,7 +415,7 @@ def coloured(model: Any, data: Any, points: Array, normals: Array, on: Any, pain
 def rendered(
     model: Any, data: Any, labels: NDArray[np.int32], paint: dict[int, Any], rng: Rng
 ) -> dict[str, Any]:
-    """One view: 1/z, labels, cosine of incidence and colours (H, W), focal length, and the camera's pose."""
+    """Render a view: 1/z, labels, cosine of incidence and colours (H, W); focal length, up, and height."""
     focal = rng.uniform(0.8, 1.3) * (1.0 if rng.random() < 0.6 else 1.6) * WIDTH
     on_table = data.xpos[1:][data.xpos[1:, 2] > -0.03]
     target = np.array([*0.05 * rng.normal(size=2), rng.uniform(0.0, 0.1)])
@@ -464,7 +464,7 @@ def make_scenes(folder: tyro.conf.Positional[Path], count: int = 1800, seed: int
 
 
 def crop(views: dict[str, Any], rng: Rng) -> tuple[Any, ...] | None:
-    """Noisy depth, colours, labels, K, up and height of a crop around objects; None if it has hardly any."""
+    """Return noisy depth, colours, labels, K, up and height of a crop; None if it hardly shows objects."""
     k = int(rng.integers(VIEWS))
     inverse = views["inverse"][k] / np.float32(20000.0)
     labels, cosine = views["labels"][k], views["cosine"][k]
@@ -482,7 +482,7 @@ def crop(views: dict[str, Any], rng: Rng) -> tuple[Any, ...] | None:
         return ndimage.map_coordinates(image, at, order=order, mode="constant", cval=0)
 
     nearest, smooth = taken(inverse, 0), taken(inverse, 1)
-    # On one surface, planes stay planes; steps stay sharp.
+    # Planes stay planes within a surface; depth steps stay sharp.
     inverse = np.where(np.abs(smooth - nearest) < 0.02 * nearest, smooth, nearest)
     labels, cosine = taken(labels, 0), taken(cosine, 0)
     rgb = np.stack([taken(views["rgb"][k][..., c], 1) for c in range(3)], axis=-1)
@@ -493,7 +493,7 @@ def crop(views: dict[str, Any], rng: Rng) -> tuple[Any, ...] | None:
         cx, up[0] = CROP - 1 - cx, -up[0]
     scale = rng.uniform(0.75, 1.35)
     depth = noisy(np.ascontiguousarray(inverse / scale), cosine / 255.0, rng)
-    if rng.random() < 0.25:  # something transparent: readings lie behind it, or nowhere
+    if rng.random() < 0.25:  # a transparent object: readings lie behind it or are missing
         places = labels[labels > 0]
         clear = labels == (places[int(rng.integers(len(places)))] if len(places) else 0)
         depth = np.where(clear, depth + 0.06 * np.maximum(waves(rng, 8, 40), 0.0), depth)
@@ -505,7 +505,7 @@ def crop(views: dict[str, Any], rng: Rng) -> tuple[Any, ...] | None:
 
 
 def photographed(rgb: Any, rng: Rng) -> Any:
-    """Colours (H, W, 3) uint8 as some camera gives them: toned, noisy, blurred, and off the depth image."""
+    """Return colours (H, W, 3) uint8 as from a camera: toned, blurred, noisy, and offset from the depth."""
     image = (rgb.astype(np.float32) + 1.0) / 256.0
     image = image ** np.float32(rng.uniform(0.5, 1.8)) * rng.uniform(0.6, 1.4, 3).astype(np.float32)
     grey = image.mean(axis=-1, keepdims=True)
@@ -520,7 +520,7 @@ def photographed(rgb: Any, rng: Rng) -> Any:
 
 
 def noisy(inverse: Any, cosine: Any, rng: Rng) -> Any:
-    """Depth (H, W) [m] as some sensor gives it: shifted, mixed, blurred, rounded, and with gaps."""
+    """Return depth (H, W) [m] as from a sensor: with frayed and mixed edges, noise, rounding, and gaps."""
     true = inverse
     if rng.random() < 0.7:  # edges fray
         spread = rng.uniform(0.2, 0.9)
@@ -535,18 +535,18 @@ def noisy(inverse: Any, cosine: Any, rng: Rng) -> Any:
     depth = np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0.0)
     sigma = rng.uniform(0.1, 1.3) * (0.0008 + 0.0019 * np.maximum(depth - 0.3, 0.0) ** 2)
     depth = depth + sigma * rng.normal(size=depth.shape)
-    if rng.random() < 0.7:  # errors that neighbours share
+    if rng.random() < 0.7:  # errors that neighbouring pixels share
         depth = depth + rng.uniform(0.0, 0.003) * depth**2 * waves(rng, 6, 60)
     inverse = np.where(inverse > 0.0, 1.0 / np.maximum(depth, 0.01), 0.0)
     if rng.random() < 0.5:
         step = rng.uniform(0.0005, 0.004)
         inverse = np.round(inverse / step) * step
     gone = cosine < np.cos(np.radians(rng.uniform(70.0, 88.0)))
-    if rng.random() < 0.7:  # no readings beside steps
+    if rng.random() < 0.7:  # no readings next to depth steps
         edge = depth_edges(true, rng.uniform(0.01, 0.05))
         edge = ndimage.binary_dilation(edge) if rng.random() < 0.4 else edge
         gone |= edge & (rng.random(edge.shape) < (rng.uniform(0.3, 1.0) if rng.random() < 0.5 else 1.0))
-    if rng.random() < 0.5:  # black or shiny places
+    if rng.random() < 0.5:  # black or shiny spots
         gone |= waves(rng, 8, 50) > rng.uniform(1.6, 3.0)
     return np.divide(1.0, inverse, out=np.zeros_like(inverse), where=~gone & (inverse > 0.0)).astype(
         np.float32
@@ -554,7 +554,7 @@ def noisy(inverse: Any, cosine: Any, rng: Rng) -> Any:
 
 
 def waves(rng: Rng, fewest: int, most: int) -> Any:
-    """A smooth random image of unit variance with so many bumps across."""
+    """Draw a smooth random image of unit variance, with `fewest` to `most` bumps across."""
     count = int(rng.integers(fewest, most))
     return ndimage.zoom(
         rng.normal(size=(count, count)), CROP / count, order=3, grid_mode=True, mode="nearest"
@@ -565,7 +565,7 @@ def waves(rng: Rng, fewest: int, most: int) -> Any:
 
 
 def feed(queue: Any, folder: Path, seed: int) -> None:
-    """Put in features (B, 11, H, W), labels (B, H, W) and which samples have readings (B, H, W), for ever."""
+    """Fill the queue endlessly with features (B, 11, H, W), labels (B, H, W) and valid pixels (B, H, W)."""
     rng, scenes = np.random.default_rng(seed), dict[Path, dict[str, Any]]()
     while True:
         files, crops = sorted(folder.glob("*.npz")), list[tuple[Any, ...]]()
@@ -593,7 +593,7 @@ def train(folder: tyro.conf.Positional[Path], minutes: float = 120.0, out: Path 
         )
 
     class Network(nn.Module):  # type: ignore[misc]
-        """A U-Net from half the resolution down, with a thin path at the full one."""
+        """A U-Net at half resolution and below, with a thin path at full resolution."""
 
         def __init__(self, widths: tuple[int, ...] = (32, 48, 64, 96, 128)) -> None:
             super().__init__()
@@ -613,7 +613,7 @@ def train(folder: tyro.conf.Positional[Path], minutes: float = 120.0, out: Path 
             return self.last(torch.cat([functional.pixel_shuffle(y, 2), full], 1))
 
     def targets(labels: Any, valid: Any) -> tuple[Any, Any]:
-        """What the network should say (B, 13, H, W), and how much each place counts."""
+        """Return the target outputs (B, 13, H, W), and the weight of each pixel (B, 13, H, W)."""
         said, counts, (_, height, width) = [], [], labels.shape
         for down, right in OFFSETS:
             here = np.s_[:, : height - down, max(0, -right) : width - max(0, right)]
@@ -661,7 +661,7 @@ def train(folder: tyro.conf.Positional[Path], minutes: float = 120.0, out: Path 
 
 
 def store_in_half(model: Path) -> None:
-    """Store the weights of a network with 16 bits; they become 32 again where it is loaded."""
+    """Store a network's weights in 16 bits; casts in the network restore 32 bits when it is loaded."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 

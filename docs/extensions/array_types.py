@@ -1,4 +1,4 @@
-"""NumPy's types of arrays by their names: what they stand for fills lines and tells a reader nothing."""
+"""Show NumPy's array types by name: their definitions fill lines and tell a reader nothing."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy.typing
 
 
 class NDArray:
-    """What annotations of arrays are in the reference."""
+    """Replaces `numpy.typing.NDArray` in the reference."""
 
     __class_getitem__ = classmethod(types.GenericAlias)
 
 
 class ArrayLike:
-    """What annotations of what becomes an array are there."""
+    """Replaces `numpy.typing.ArrayLike` in the reference."""
 
 
 def keep_their_names() -> None:
-    """Put the names in the place of the types; before the modules are imported that use them."""
+    """Replace the types by these classes; call this before importing modules that use them."""
     for kind in (NDArray, ArrayLike):
         kind.__module__ = "numpy.typing"
         setattr(numpy.typing, kind.__name__, kind)

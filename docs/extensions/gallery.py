@@ -1,4 +1,4 @@
-"""The programs of `examples/` as sphinx-gallery wants them: copied, each with a title over its docstring."""
+"""Copy the programs of `examples/` for sphinx-gallery, each with a title above its docstring."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ Short programs. Each runs when this page is built; its output follows it. Each c
 ground truth. The client is only shown, because it needs a running service.
 """
 RUN = re.compile(r"/\d\d_")
-"""Which of the programs are run: those with a number. The client needs a running service."""
+"""Matches the programs to run: those with a number. The client needs a running service."""
 
 
 def copy_examples(examples: Path, destination: Path) -> None:
-    """Copy the programs, titled by their names; what has not changed is not written again.
+    """Copy the programs, with titles from their names; unchanged copies are not rewritten.
 
     Args:
-        examples: Where they are.
-        destination: Where sphinx-gallery looks for them.
+        examples: Folder of the programs.
+        destination: Folder in which sphinx-gallery looks for them.
     """
     destination.mkdir(parents=True, exist_ok=True)
     texts = {path.name: _titled(path) for path in sorted(examples.glob("*.py"))}
@@ -35,13 +35,13 @@ def copy_examples(examples: Path, destination: Path) -> None:
 
 
 def title_of(path: Path) -> str:
-    """Make a title of a program's name: `06_robot_over_http.py` is Robot over HTTP."""
+    """Make a title from a program's name: `06_robot_over_http.py` becomes Robot over HTTP."""
     words = re.sub(r"^\d+_", "", path.stem).replace("_", " ").replace("http", "HTTP")
     return words[0].upper() + words[1:]
 
 
 def _titled(path: Path) -> str:
-    """Return a program with its title as the first lines of its docstring, which is then reStructuredText."""
+    """Return a program with a title at the top of its docstring, converted to reStructuredText."""
     title = title_of(path)
     # An indented block after a colon is code.
     opening, text, rest = path.read_text(encoding="utf-8").split('"""', 2)

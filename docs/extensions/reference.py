@@ -1,4 +1,4 @@
-"""Directives that write the reference from the code: `every-command` and `every-setting`."""
+"""Directives that generate the reference from the code: `every-command` and `every-setting`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from caryatid import cli, config
 from caryatid.config.settings import field_docs
 
 WIDTH = 100
-"""Columns of the help."""
+"""Width of the help [characters]."""
 
 
 def help_of(command: str) -> str:
@@ -38,13 +38,13 @@ def help_of(command: str) -> str:
 
 
 def commands_of(command: str) -> list[str]:
-    """Return the commands that a command has; of `caryatid` itself for an empty one."""
+    """Return the subcommands of a command; an empty name means `caryatid` itself."""
     listed = re.search(r"^usage:.*?\{([\w,-]+)\}", help_of(command), re.M | re.S)
     return listed[1].split(",") if listed else []
 
 
 def command_pages() -> str:
-    """Return the help of all commands, and of theirs, as Markdown."""
+    """Return the help of all commands and subcommands as Markdown."""
     lines = []
     for name in commands_of(""):
         lines.append(f"## {name}\n")
@@ -65,17 +65,17 @@ class EveryCommand(SphinxDirective):
 
 
 def kind_of(stage: str) -> Any:
-    """Return the class of a stage's settings; a stage that no file holds is named by its class."""
+    """Return the settings class of a stage; a stage outside settings files is named by its class."""
     return getattr(config, stage) if stage in config.__all__ else type(getattr(config.Config(), stage))
 
 
 def table_of(stage: str) -> str:
-    """Return the settings of a stage as Markdown, with what the code says of each."""
+    """Return the settings of a stage as a Markdown table, with their descriptions in the code."""
     kind = kind_of(stage)
     values = kind()
     ranges = get_type_hints(kind, include_extras=True)
     reasons = field_docs(kind)
-    lines = ["| setting | default | allowed | what, and why this value |", "|---|---|---|---|"]
+    lines = ["| setting | default | allowed | description, and reason for the value |", "|---|---|---|---|"]
     for field in fields(kind):
         unit, reason = _unit(reasons.get(field.name, ""))
         cells = [
@@ -109,7 +109,7 @@ SIGNS = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
 
 
 def _allowed(kind: Any) -> str:
-    """Say which values a type allows."""
+    """Describe the values that a type allows."""
     if get_origin(kind) is Annotated:
         plain, *rules = get_args(kind)
         limits = [
@@ -132,7 +132,7 @@ def _allowed(kind: Any) -> str:
 
 
 def settings_page() -> str:
-    """Return the tables of all stages as Markdown; first those a file of settings holds."""
+    """Return the tables of all stages as Markdown; those in settings files come first."""
     held = [field.name for field in fields(config.Config)]
     own = {type(getattr(config.Config(), stage)).__name__ for stage in held}
     others = [name for name in config.__all__ if name.endswith("Config") and name not in {"Config", *own}]

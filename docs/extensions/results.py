@@ -1,4 +1,4 @@
-"""A picture of what a program found, for its page: programs print, and draw nothing."""
+"""Draw a picture of an example program's result for its page; the programs themselves only print."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.pictures import picture_png
 
 _seen: dict[str, Any] = {}
-"""The last of each kind of what the program that runs has made."""
+"""The last result of each kind of the program that is running."""
 
 
 def watch() -> None:
-    """Keep the last graph, fit and view of programs."""
+    """Record the last graph, fit and view of programs."""
     Scene.update = _kept("graph", Scene.update)  # type: ignore[method-assign]
     primitives.fit = _kept("fit", primitives.fit)
     SimulatedCamera.capture = _kept("view", SimulatedCamera.capture)  # type: ignore[method-assign]
@@ -39,12 +39,12 @@ def _kept(kind: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def forget(configuration: Any, program: str) -> None:
-    """Forget what the program before made."""
+    """Forget the results of the previous program."""
     _seen.clear()
 
 
 def take_picture(block: Any, variables: dict[str, Any], configuration: Any) -> str:
-    """Draw what a program found: its graph, else the shape it fitted, else what its camera saw."""
+    """Draw a program's result: its graph, else the shape it fitted, else the view of its camera."""
     if not _seen:
         return ""
     graph, fit, view = (_seen.get(kind) for kind in ("graph", "fit", "view"))

@@ -1,6 +1,6 @@
-"""Run the notebooks beside this file and keep what they show: python docs/notebooks/execute.py.
+"""Run the notebooks in this folder and store their outputs: python docs/notebooks/execute.py.
 
-The same code gives the same bytes: nothing of when, where or how long is kept.
+The same code gives the same bytes: no times, places or durations are stored.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ __all__ = ["CellExecutionError", "execute", "notebooks"]
 
 FOLDER = Path(__file__).parent
 TIME_LIMIT = 600
-"""What one cell may take [s]."""
+"""Maximum duration of one cell [s]."""
 KERNEL = {"display_name": "Python 3", "language": "python", "name": "python3"}
 
 
 def notebooks() -> list[Path]:
-    """All notebooks beside this file."""
+    """Return all notebooks in this folder."""
     return sorted(FOLDER.glob("*.ipynb"))
 
 
@@ -31,8 +31,8 @@ def execute(path: Path, parameters: Mapping[str, object] | None = None) -> Noteb
     """Run a notebook and return it with its outputs.
 
     Args:
-        path: The notebook; it is not changed.
-        parameters: Values in place of those that its cell tagged `parameters` gives.
+        path: The notebook; the file is not changed.
+        parameters: Values that replace those in the cell tagged `parameters`.
 
     Raises:
         CellExecutionError: A cell fails.
@@ -48,7 +48,7 @@ def execute(path: Path, parameters: Mapping[str, object] | None = None) -> Noteb
 
 
 def _without_traces(notebook: NotebookNode) -> NotebookNode:
-    """Leave out what depends on the machine, and join texts that came in pieces."""
+    """Remove what depends on the machine, and join text outputs that arrived in pieces."""
     notebook.metadata = NotebookNode(kernelspec=KERNEL, language_info={"name": "python"})
     for cell in notebook.cells:
         if cell.cell_type == "code":
@@ -69,7 +69,7 @@ def _joined(outputs: list[NotebookNode]) -> list[NotebookNode]:
 
 
 def main() -> int:
-    """Run all of them and write them back."""
+    """Run all notebooks, and write them back."""
     for path in notebooks():
         nbformat.write(execute(path), path)
         print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB")

@@ -1,11 +1,11 @@
-"""The documentation's pictures: each stage of the loop on one scene, the film of README.md, and the viewer.
+"""Draw the documentation's pictures: each stage of the loop on one scene, README.md's film, and the viewer.
 
     python docs/pictures/draw.py concepts
     python docs/pictures/draw.py film
     python docs/pictures/draw.py viewer
 
-The same command draws the same pictures; the first two byte for byte, with the drawings of reports
-(`caryatid.viz`), the last one in Chromium.
+The same command always draws the same pictures. The first two commands draw with `caryatid.viz`, like
+reports, and reproduce each file byte for byte; the last one takes screenshots in Chromium.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ PICTURES = Path(__file__).parent
 TITLE = 24.0
 """Height of a line of text above a picture [px]."""
 PLANE, NORMAL = 0.042, 0.05
-"""Half the side of a separating plane and the length of its normal as drawn [m]."""
+"""Half the side of a drawn separating plane, and the length of its drawn normal [m]."""
 LOOK, KNOW, CHOOSE, END = 900, 2000, 2200, 4000
-"""How long what was seen, what is known, what is chosen, and the end stand in the film [ms]."""
+"""How long the film shows the view, the model, the choice, and the end [ms]."""
 SOLIDS = (
     box((0.1, 0.2, 0.28), at=(-0.08, 0.14, 0.14), density=1200.0, friction=0.1),
     box((0.02, 0.09, 0.24), at=(-0.169, 0.14, 0.1215), turn=(0.0, 14.0, 0.0), friction=0.1),
@@ -71,7 +71,7 @@ Titled = tuple[Picture, str]
 
 
 def sheet(pictures: Sequence[Titled], width: int, columns: int, heading: str = "") -> Image.Image:
-    """Put pictures with their titles on one page, in rows of cells of this width [px]."""
+    """Arrange titled pictures on one page, in rows of cells of this width [px]."""
     rows = [pictures[k : k + columns] for k in range(0, len(pictures), columns)]
     heights = [TITLE + max(width * p.height / p.width for p, _ in row) for row in rows]
     top = 1.4 * TITLE if heading else 0.0
@@ -93,14 +93,14 @@ def sheet(pictures: Sequence[Titled], width: int, columns: int, heading: str = "
 
 
 def plain(view: View, labels: NDArray[np.int32] | None = None, graph: SupportGraph | None = None) -> Picture:
-    """A view, and its segments where labels are given, without the shapes."""
+    """Draw a view without shapes, with its segments if labels are given."""
     none = np.zeros(view.depth.shape, np.int32)
     shown = none if labels is None else labels
     return draw_image(view, shown, graph or SupportGraph(), view.depth.shape[1], shapes=False)
 
 
 def planes(step: Step, supports: Sequence[Support]) -> Picture:
-    """A view with the separating planes of supports and their normals."""
+    """Draw a view with the separating planes of supports and their normals."""
     view = step.view
     assert view is not None
     base, projection = plain(view), Projection(view.pose, view.K, view.depth)
@@ -123,12 +123,12 @@ def planes(step: Step, supports: Sequence[Support]) -> Picture:
 
 
 def azimuth_of(view: View) -> float:
-    """Direction about the vertical a view looks from [rad]."""
+    """Return the azimuth from which a view looks [rad]."""
     return float(np.arctan2(-view.pose[1, 2], -view.pose[0, 2]))
 
 
 def concepts() -> dict[str, Image.Image]:
-    """A picture of each stage of the loop."""
+    """Draw a picture of each stage of the loop."""
     config = replace(Config(), active=replace(Config().active, max_views=4))
     scene = scene_from_spec(build_spec(SOLIDS, "concepts"), "concepts", "concepts", least=1.0)
     simulation = make_simulation(scene, config, noise="carmine", seed=0)
@@ -171,14 +171,14 @@ def concepts() -> dict[str, Image.Image]:
         "graph": (
             [
                 (draw_cloud(last.cloud, last.graph, azimuth_of(views[-1])), "the shapes after four views"),
-                (draw_graph(last.graph), "what holds up what, with probabilities"),
+                (draw_graph(last.graph), "which object supports which, with probabilities"),
             ], 560, 2,
         ),
         "fusion": ([(draw_graph(steps[k].graph), f"after view {k + 1}") for k in (0, 1, 3)], 420, 3),
         "interest": ([(draw_sphere(paper), "points of interest and their saliency")], 560, 1),
         "next": (
             [
-                (draw_sphere(first), "what each view would show, less the way there"),
+                (draw_sphere(first), "what each view would show, minus the path length"),
                 (plain(views[1]), "the view that was chosen"),
             ], 520, 2,
         ),
@@ -188,7 +188,7 @@ def concepts() -> dict[str, Image.Image]:
 
 
 def film() -> tuple[list[Image.Image], list[int]]:
-    """Explore a scene; frames of what is seen, known and chosen, and how long each stands [ms]."""
+    """Explore a scene; return frames of the view, the model and the choice, and their durations [ms]."""
     scene, config = load_scene("clutter"), Config()
     truth = true_scene_from_simulation(scene, ground_truth(scene))
     simulation = make_simulation(scene, config, noise="carmine", seed=0)
@@ -222,7 +222,7 @@ def film() -> tuple[list[Image.Image], list[int]]:
 
 @contextmanager
 def viewing(browser: Any, source: str, **options: Any) -> Iterator[tuple[LoopPage, Any]]:
-    """A viewer's page after its first view, and the tab of Chromium that shows it."""
+    """Open a viewer's page, take its first view, and show it in a tab of Chromium."""
     from browser import Tab
 
     opening = partial(open_source, source, noise="carmine", segmentation=None, seed=0)
@@ -235,12 +235,12 @@ def viewing(browser: Any, source: str, **options: Any) -> Iterator[tuple[LoopPag
 
 
 def viewer() -> Iterator[tuple[str, Image.Image]]:
-    """What the viewer shows of a scene and of a recording."""
+    """Take screenshots of the viewer, with a scene and with a recording."""
     sys.path.insert(0, str(PICTURES.parents[1] / "tests"))
     from browser import chromium
 
     def shot(tab: Any) -> Image.Image:
-        tab.page.wait_for_timeout(2000)  # Text is laid out, then pictures are decoded.
+        tab.page.wait_for_timeout(2000)  # The browser lays out text, then decodes pictures.
         tab.settle()
         return Image.open(io.BytesIO(tab.page.screenshot())).convert("RGB")
 
