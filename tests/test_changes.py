@@ -149,6 +149,53 @@ def test_changes_that_the_robot_reported_hold_when_it_looks_again(scene, state):
     assert edges(scene.graph) == edges(said)
 
 
+@pytest.mark.parametrize("method", ["pc", "sg", "pc+sg"])
+def test_an_object_that_the_newest_view_did_not_show_can_be_moved_and_then_taken(method, scene, state):
+    views = simulated_views("tower")
+    hidden = replace(views[-1], depth=views[-1].depth * (views[-1].labels != 5), labels=views[-1].labels)
+    scene = model_of(
+        (*views[:-1], replace(hidden, labels=np.where(hidden.labels == 5, 0, hidden.labels))),
+        config_for(method),
+    )
+    before = scene.graph["o5"]
+    scene.moved("o5", ASIDE)
+    np.testing.assert_allclose(scene.graph["o5"].centre_world - before.centre_world, ASIDE[:3, 3], atol=1e-3)
+    state[4, 2] += 50.0
+    for view in views_of(state, [50.0, 170.0, 200.0]):
+        scene.update(view)
+    assert kinds(scene) == [("moved", "o5"), ("removed", "o5")]
+    assert "o5" not in vertices(scene.graph)
+
+
+@pytest.mark.parametrize("method", ["sg", "pc+sg"])
+def test_what_somebody_moved_out_of_sight_is_in_one_place(method, state):
+    """The view that shows the ball in its new place does not show the old one."""
+    scene = model_of(views_of(state, [0.0, 120.0, 240.0]), config_for(method))
+    before = scene.graph["o5"]
+    state[4, 1] += 0.12
+    (view,) = views_of(state, [50.0])
+    own = ndimage.binary_dilation(view.labels == 5, iterations=2)
+    scene.update(replace(view, depth=np.where(own | (view.labels == 0), view.depth, 0.0).astype(np.float32)))
+    np.testing.assert_allclose(scene.graph["o5"].centre_world - before.centre_world, (0, 0.12, 0), atol=0.01)
+    np.testing.assert_allclose(scene.graph["o5"].shape.extents, before.shape.extents, atol=0.01)
+
+
+def test_what_the_robot_puts_down_has_the_number_of_its_masks_and_no_colour(state):
+    without = state.copy()
+    without[4, 2] += 50.0
+    first, second = views_of(without, [0.0, 120.0])
+    scene = model_of([first, second])
+    ball = model_of(views_of(state, [0.0, 120.0])).graph["o5"].shape
+    assert scene.added(ball, label=5) == "o5"
+    for view in views_of(state, [240.0, 60.0]):
+        scene.update(view)
+    assert vertices(scene.graph) == {f"o{k}" for k in range(6)}
+    assert kinds(scene) == [("added", "o5")]
+    cloud = scene.cloud
+    assert cloud.rgb is not None
+    assert cloud.rgb[cloud.labels == 1].any()
+
+
 def test_only_objects_can_be_taken_and_only_what_is_rigid_moves(scene):
     for object_id in ("o0", "o9"):
         with pytest.raises(InputError, match=f"{object_id}.*is not an object"):
@@ -158,6 +205,9 @@ def test_only_objects_can_be_taken_and_only_what_is_rigid_moves(scene):
     for size in (60.0, -0.06):
         with pytest.raises(InputError, match="shape"):
             scene.added(box((-0.2, -0.2, 0.78), (0.06, 0.06, size)))
+    for label in (0, 3, 65535):
+        with pytest.raises(InputError, match=f"label: {label} is not free"):
+            scene.added(box((-0.2, -0.2, 0.78), (0.06, 0.06, 0.06)), label)
     with pytest.raises(InputError, match="add a view first"):
         Scene().added(box((0.0, 0.0, 0.8), (0.1, 0.1, 0.1)))
     assert scene.changes == ()

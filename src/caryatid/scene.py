@@ -203,17 +203,18 @@ class Scene(Pictured):
         self._reported("moved", object_id)
         return self.graph
 
-    def added(self, shape: Shape) -> str:
+    def added(self, shape: Shape, label: int | None = None) -> str:
         """Report that an object was added.
 
         Args:
             shape: Its shape and pose, in the world frame.
+            label: Its number in the masks of later views; None if it has none yet.
 
         Returns:
             Id of the new object.
 
         Raises:
-            InputError: The scene has no views, or the shape no possible size.
+            InputError: The scene has no views, the shape no possible size, or the label is not free.
         """
         if self.voxels is None:
             raise InputError("scene", "has no views", "add a view first")
@@ -221,7 +222,11 @@ class Scene(Pictured):
         if not 0.0 < shape.extents.min() <= shape.extents.max() <= self.config.cloud.max_depth:
             reason = f"has extents of {shape.extents.round(3).tolist()} m"
             raise InputError("shape", reason, "give lengths above 0, in metres")
-        label = self._models.put(shape, self.views - 1)
+        label = max(self._taken()) + 1 if label is None else label
+        if label in self._taken() or not 0 < label < SUPPORT_LABEL:
+            remedy = f"give a number from 1 to {SUPPORT_LABEL - 1} that no other object has"
+            raise InputError("label", f"{label} is not free", remedy)
+        self._models.put(shape, label, self.views - 1)
         self._ids = self._ids | {label: object_id(label)}
         self.voxels = self.voxels.forgotten(self.voxels.within(shape, np.zeros((0, 3))))
         self._reported("added", object_id(label))
@@ -239,6 +244,11 @@ class Scene(Pictured):
         known = ", ".join(o.id for o in self.graph.objects if o.role == "object")
         raise InputError(object_id, "is not an object of the graph", f"known objects: {known or 'none'}")
 
+    def _taken(self) -> set[int]:
+        """Labels that objects have or had, and 0."""
+        own = {o.label for o in self.graph.objects if o.role == "object"}
+        return {0, self._models.points.labels_used, *self._models.points.objects, *own}
+
     def _forget(self, o: SceneObject, T: Array | None = None) -> None:
         """Forget an object, or move its points and shape by T; its supports are dropped."""
         label = self._label_of(o.id)
@@ -248,10 +258,14 @@ class Scene(Pictured):
             if T is not None:
                 which |= self.voxels.within(o.shape.moved(T), np.zeros((0, 3)))
             self.voxels = self.voxels.forgotten(which)
-        if label is not None and T is None:
-            self._models.forget({label})
-        elif label is not None and T is not None:
+        if T is not None and label in self._models.fits:
             self._models.relocate(label, T)
+        else:
+            self._models.forget(set() if label is None else {label})
+            if T is not None:  # With `sg`, only objects of the newest view have a fit.
+                label = max(self._taken()) + 1
+                self._models.put(o.shape.moved(T), label, self.views - 1)
+                self._ids = self._ids | {label: o.id}
         self._graphs = tuple(without(graph, {o.id}) for graph in self._graphs)
         self._shown = tuple(ids - {o.id} for ids in self._shown)
 
@@ -261,13 +275,14 @@ class Scene(Pictured):
             if known == object_id:
                 return label
         label = int(object_id[1:])
-        return None if self.config.fusion.method == "sg" or label in self._ids else label
+        per_view = self.config.fusion.method == "sg" and not self.identified
+        return None if per_view or label in self._ids else label
 
     def _reported(self, kind: ChangeKind, object_id: str) -> None:
         """Record what the robot did, and derive the graph again."""
         assert self.surface is not None
         assert self.voxels is not None
-        self._detector.history += (Change(kind, object_id, self.views, "reported by the robot"),)
+        self._detector.report(Change(kind, object_id, self.views, "reported by the robot"))
         newest = self._inferred(self.surface, self.voxels)
         names = {o.id: self._ids.get(o.label, o.id) for o in newest.objects if o.role == "object"}
         newest = renamed(newest, names)
@@ -536,7 +551,7 @@ class Scene(Pictured):
             return {}, {}
         missing = self._detector.missing(view, self._surfaces())
         new = dict[int, str]()
-        if self.config.fusion.method != "sg":
+        if named or self.config.fusion.method != "sg":
             rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
             points = observation.cloud.points_world[rows]
             new = appeared(view.name, points, observation.labels[rows], voxels.states_around(points))
@@ -546,10 +561,10 @@ class Scene(Pictured):
         for id_ in missing:
             o = next((o for o in self.graph.objects if o.id == id_), None)
             self._detector.lose(id_, o)
-            if o is None:
-                self._models.forget({int(id_[1:])})
-            else:
+            if o is not None:
                 self._forget(o)
+            elif (label := self._label_of(id_)) is not None:
+                self._models.forget({label})
         if new:
             pixels = np.zeros(view.depth.shape, dtype=np.bool_)
             pixels.ravel()[observation.pixels] = np.isin(observation.labels, sorted(new))

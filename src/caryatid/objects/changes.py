@@ -70,6 +70,11 @@ class ChangeDetector:
                 missing[object_id] = f"{view.name} sees through {through} of {total} points of its surface"
         return missing
 
+    def report(self, change: Change) -> None:
+        """Add a change that the robot made; earlier views no longer contradict the object."""
+        self._odds = {k: odds for k, odds in self._odds.items() if k != change.object_id}
+        self.history = (*self.history, change)
+
     def lose(self, object_id: str, o: SceneObject | None) -> None:
         """Record an object as missing; its shape helps to find it again."""
         self._odds.pop(object_id, None)
@@ -95,7 +100,7 @@ class ChangeDetector:
             label = label_of(object_id)
             among = [k for k in sorted(self._unmatched - found.keys()) if alike(fits[k], o)]
             if among and label is not None:
-                found[among[0]] = label
+                found[min(among, key=lambda k: extents_ratio(fits[k], o))] = label
         self._unmatched -= found.keys()
         return found
 

@@ -56,6 +56,7 @@ class ObjectPoints:
         self._cloud = Cloud(np.zeros((0, 3)), np.zeros((0, 3)))
         self._labels = np.zeros(0, dtype=np.int32)
         self._views = np.zeros(0, dtype=np.intp)
+        self._colourless: frozenset[int] = frozenset()
         self._selected: dict[tuple[int, float], Cloud] = {}
 
     def copy(self) -> ObjectPoints:
@@ -79,6 +80,12 @@ class ObjectPoints:
         self._relabel(np.concatenate([self._labels, labels]), changed)
         self.labels_used = max(self.labels_used, *(changed - {SUPPORT_LABEL}), 0)
 
+    def put(self, cloud: Cloud, label: int, view: int) -> None:
+        """Add points of an object that no view showed; its colour stays unknown."""
+        rgb = None if self._cloud.rgb is None else np.zeros((len(cloud), 3), dtype=np.uint8)
+        self.add(replace(cloud, rgb=rgb), np.full(len(cloud), label, dtype=np.int32), view)
+        self._colourless |= {label}
+
     @property
     def objects(self) -> list[int]:
         """Labels of the objects, without the support surface."""
@@ -92,7 +99,8 @@ class ObjectPoints:
                 cloud = self.of(label)
                 self._selected[label, edge] = cloud.select(thin(cloud.points_world, edge))
             else:
-                self._selected[label, edge] = self._select(np.flatnonzero(self._labels == label))
+                cloud = self._select(np.flatnonzero(self._labels == label))
+                self._selected[label, edge] = replace(cloud, rgb=None) if label in self._colourless else cloud
         return self._selected[label, edge]
 
     def newest(self, label: int) -> Cloud:
@@ -143,6 +151,7 @@ class ObjectPoints:
 
     def merge(self, old: int, new: int) -> None:
         """Give the points of one object to another."""
+        self._colourless |= {new} if old in self._colourless else set()
         # Stable: of the two, the points of the new one come first.
         order = np.argsort(np.where(self._labels == old, 2, self._labels == new), kind="stable")
         self._reorder(order, np.where(self._labels == old, np.int32(new), self._labels), {old, new})
@@ -252,12 +261,10 @@ class ObjectModels:
         self._distinct = {frozenset(new if k == old else k for k in two) for two in self._distinct}
         self._forget({old, new})
 
-    def put(self, shape: Shape, view: int) -> int:
-        """Add an object of this shape, as if a view had shown it from all sides; returns its label."""
-        label, (points, normals) = self.points.labels_used + 1, shape.surface(self._config.cloud.voxel)
-        self.points.add(Cloud(points, normals), np.full(len(points), label, dtype=np.int32), view)
+    def put(self, shape: Shape, label: int, view: int) -> None:
+        """Add an object of this shape, as if a view had shown it from all sides."""
+        self.points.put(Cloud(*shape.surface(self._config.cloud.voxel)), label, view)
         self.fits[label] = SceneObject(object_id(label), label, shape)
-        return label
 
     def associate(
         self,
