@@ -75,15 +75,19 @@ class RobotClient:
 
     def take(self, name: str, object_id: str, T: Matrix | None = None) -> dict[str, Any]:
         """Report that an object was removed, or moved by a rigid transform T in the world frame."""
-        return self._ask("POST", f"/sessions/{name}/reports", {"object": object_id, "T": T})
+        report = {"object": object_id, "T": T, "number": self._known(name)["reports"]}
+        return self._ask("POST", f"/sessions/{name}/reports", report)
 
     def undo(self, name: str) -> dict[str, Any]:
         """Take back the last view, or the report after it."""
         return self._ask("DELETE", f"/sessions/{name}/views/last")
 
     def views(self, name: str) -> int:
-        """How many views a session has."""
-        return int(self._ask("GET", f"/sessions/{name}")["views"])
+        """Number of views of a session."""
+        return int(self._known(name)["views"])
+
+    def _known(self, name: str) -> dict[str, Any]:
+        return self._ask("GET", f"/sessions/{name}")
 
     def _ask(self, method: str, path: str, body: dict[str, Any] | None = None) -> dict[str, Any]:
         data = None if body is None else json.dumps(body).encode()
@@ -98,8 +102,8 @@ class RobotClient:
                 if error.code != 503 or time.monotonic() - begun > self.patience:
                     raise RuntimeError(f"{method} {path}: {error.code} {error.read().decode()}") from None
             except (OSError, http.client.HTTPException):
-                # No retry: a second undo removes another view, a second report moves the object again.
-                once = method == "DELETE" or path == "/sessions" or path.endswith("/reports")
+                # No retry: a second undo removes another view. Numbers make views and reports safe to repeat.
+                once = method == "DELETE" or path == "/sessions"
                 if once or time.monotonic() - begun > self.patience:
                     raise
             time.sleep(0.2)

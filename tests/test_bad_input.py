@@ -53,8 +53,9 @@ def test_a_segment_of_three_points(tmp_path, views, refused):
             "lie on surfaces of earlier views",
         ),
         (lambda v: replace(v, K=v.K * [[1.0], [1e12], [1.0]]), "K is implausible .* 160×120 pixels"),
+        (lambda v: replace(v, depth=np.full_like(v.depth, 5.0)), "readings are at 5 m, none within"),
     ],
-    ids=["pose", "camera"],
+    ids=["pose", "camera", "depth"],
 )
 def test_a_view_that_cannot_be_right_is_left_out(tmp_path, views, refused, capsys, change, says):
     write_recording(tmp_path / "wrong", [*views[:2], change(views[2])])

@@ -253,8 +253,10 @@ def test_charts_need_several_views_or_scores_and_changes_are_listed(make_step):
     (changed,) = (s.text for s in make_report("t", steps, config=SMALL).sections if s.title == "View 2")
     assert "now: o1 (box) supported by the table, o2 (cylinder) supported by o1; gone: o7" in changed
     taken = Change("removed", "o2", 1, "empty <space> where it stood")
-    page = Page(render_html(make_report("t", [steps[0], replace(steps[1], changes=(taken,))], config=SMALL)))
+    steps[1] = replace(steps[1], changes=(taken,))
+    page = Page(render_html(make_report("t", steps, warnings=["view 2: too few <readings>"], config=SMALL)))
     assert "o2 was removed: empty <space> where it stood" in page.text
+    assert "view 2: too few <readings>" in page.text.casefold()
     with pytest.raises(ValueError, match="1 scores for 2 views"):
         charts(steps, scores[:1])
 

@@ -8,8 +8,8 @@ import importlib
 import re
 import sys
 import xml.etree.ElementTree as ET
+from dataclasses import astuple, replace
 from dataclasses import fields as dataclass_fields
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -24,10 +24,10 @@ from caryatid.errors import InputError
 from caryatid.exploration import Explorer
 from caryatid.geometry import transforms
 from caryatid.geometry.solids import Polytope, Solid
-from caryatid.graph import Support, SupportGraph
+from caryatid.graph import Change, Grasp, Support, SupportGraph, TakeStep
 from caryatid.io.graph_json import graph_text
 from caryatid.io.mask_sources import mask_source
-from caryatid.manipulation.order import plan_order
+from caryatid.manipulation.order import Order, plan_order
 from caryatid.simulation.setup import make_simulation
 
 ROS = Path(__file__).parents[1] / "ros"
@@ -187,7 +187,9 @@ def test_a_graph_survives_the_way_to_another_node():
         Support("o1", "o2", "lean", certain=False, occurrences=2, opportunities=3),
     )
     graph, header = SupportGraph(tuple(objects), supports), image(np.zeros((1, 1)), "mono8").header
-    told = packed(messages.graph_message(make, graph, header))
+    slid = Change("moved", "o2", 3, "view 3 sees through it")
+    told = packed(messages.graph_message(make, graph, [slid], header))
+    assert [(c.kind, c.object, c.view, c.why) for c in told.changes] == [astuple(slid)]
     assert [(o.id, o.shape, o.doubt) for o in told.objects[1:3]] == [
         ("o1", "box", "leans"),
         ("o2", "cylinder", ""),
@@ -214,6 +216,16 @@ def test_a_graph_survives_the_way_to_another_node():
     names = ["CUBE", "SPHERE", "CYLINDER", "ARROW", "TEXT_VIEW_FACING", "TRIANGLE_LIST", "DELETEALL"]
     ours = ["CUBE", "SPHERE", "CYLINDER", "ARROW", "TEXT", "TRIANGLES", "DELETE_ALL"]
     assert [getattr(messages, name) for name in ours] == [constants[name] for name in names]
+
+
+def test_a_lift_says_how_the_gripper_takes_hold():
+    T = transforms.rigid(np.diag([1.0, -1.0, -1.0]), (0.1, 0.2, 0.9))
+    step = TakeStep("o1", ("o2",), True, 0.01, "it is free", Grasp(T, 0.06, 0.1))
+    (lift,) = map(packed, messages.lift_messages(make, Order((step,))))
+    (grasp,) = lift.grasp
+    np.testing.assert_allclose(messages.matrix_of(grasp.pose.orientation, grasp.pose.position, ""), T)
+    assert (lift.object, lift.hold, grasp.width, grasp.travel) == ("o1", ["o2"], 0.06, 0.1)
+    assert np.isnan(grasp.seen_free)
 
 
 def test_images_become_a_view(views):
@@ -267,6 +279,7 @@ def test_order_and_removed_do_what_the_library_does(explored):
     assert [(s.object, s.risk, s.why) for s in told.lifts] == [
         (s.object_id, s.risk, s.why) for s in wanted.steps
     ]
+    assert told.lifts[0].grasp == []
     first, other = wanted.steps[0].object_id, "o5"
     x = make("geometry_msgs/msg/Transform", translation=make("geometry_msgs/msg/Vector3", x=0.2))
     for fields in ({"object": first}, {"object": other, "moved": True, "motion": x}):
@@ -276,6 +289,7 @@ def test_order_and_removed_do_what_the_library_does(explored):
     scene.moved(other, transforms.rigid(np.eye(3), (0.2, 0.0, 0.0)))
     assert graph_text(bench.logic._explorer.scene.graph) == graph_text(scene.graph)
     assert [o.id for o in told.graph.objects] == [o.id for o in scene.graph.objects]
+    assert [(c.kind, c.object) for c in told.graph.changes] == [("removed", first), ("moved", other)]
     told = packed(bench.logic.removed(make("caryatid_msgs/srv/Removed/Request", object=first)))
     assert (told.success, told.message.split(";")[0]) == (False, f"{first}: is not an object of the graph")
     end, result = Handle(bench, max_views=1, goal="o99").run()

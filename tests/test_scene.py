@@ -127,6 +127,43 @@ def test_what_has_no_depth_on_the_table_is_left_out_with_a_word(caplog):
     assert "no depth in 1 region above the table" in caplog.text
 
 
+def near(view):
+    """A hand in front of the lens."""
+    depth = view.depth.copy()
+    depth[:100, :100] = 0.09
+    return replace(view, depth=depth)
+
+
+def without_depth(view):
+    return replace(view, depth=np.where(view.labels == 1, np.float32(0.0), view.depth))
+
+
+def cropped(view):
+    """Only 20 cm of the table, in its middle."""
+    far = (
+        np.abs(view.points_camera @ view.pose[:3, :3].T + view.pose[:3, 3]).max(
+            axis=-1, initial=0.0, where=[True, True, False]
+        )
+        > 0.1
+    )
+    return replace(view, depth=np.where(far, np.float32(0.0), view.depth))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda view: view, ""),
+        (near, "10000 readings nearer than cloud.min_depth = 0.1 m are ignored"),
+        (without_depth, "too few depth readings in mask 1; its object is missed"),
+        (cropped, "the support surface has only 0.0"),
+    ],
+)
+def test_what_a_view_lacks_is_said(change, says, caplog):
+    model_of([change(simulated_views("tower")[0])])
+    assert bool(caplog.messages) == bool(says)
+    assert says in caplog.text
+
+
 def test_labels_are_those_of_the_vertices_and_of_the_table(tower):
     view = simulated_views("tower")[-1]
     assert tower.labels.shape == view.depth.shape

@@ -90,7 +90,8 @@ def test_a_session_over_http_is_the_session(client, views):
     answers = [client.post("/sessions/a/views", json=body(view)) for view in views[:2]]
     for number, answer in enumerate(answers):
         assert answer.status_code == 201
-        told = {"view": number, "changed": True, "warnings": [], "graph": graph_of(views[: number + 1])}
+        told = {"view": number, "changed": True, "warnings": [], "changes": []}
+        told["graph"] = graph_of(views[: number + 1])
         assert told.items() <= answer.json().items()
         assert np.allclose(answer.json()["T_world_camera"], views[number].pose, atol=0.02)
 
@@ -103,7 +104,7 @@ def test_a_session_over_http_is_the_session(client, views):
     assert client.get("/sessions/a/graph").json() == graph_of(views[:2])
     assert client.get("/sessions").json() == {"sessions": ["a"]}
     options = {"segmentation": "labels", "seed": 0, "planner": "support"}
-    assert client.get("/sessions/a").json() == {"name": "a", "views": 2, **options}
+    assert client.get("/sessions/a").json() == {"name": "a", "views": 2, "reports": 0, **options}
 
     with Session.open(client.pool.folder / "a", read_only=True) as session:
         assert client.get("/sessions/a/next").json() == session.next().to_json()
@@ -121,7 +122,7 @@ def test_a_session_over_http_is_the_session(client, views):
     assert client.post("/sessions/a/reports", json=moved | {"T": np.ones((4, 4)).tolist()}).status_code == 422
     for _ in range(2):
         left = client.delete("/sessions/a/views/last").json()
-    assert left == {"views": 2, "graph": graph_of(views[:2])}
+    assert left == {"views": 2, "reports": 0, "graph": graph_of(views[:2])}
 
     for number in (1, 0):
         assert client.delete("/sessions/a/views/last").json()["views"] == number
@@ -175,6 +176,7 @@ def test_what_cannot_be_used_changes_nothing(client, views):
     assert client.get("/sessions/a").json()["views"] == 0
 
 
+LARGE = png(np.zeros((5000, 5000), np.uint8))
 NOT_BEGUN = (
     ({"name": "../b"}, 422, "name"),
     ({"name": "b" * 65}, 422, "name"),
@@ -186,6 +188,11 @@ NOT_BEGUN = (
     ({"name": "b", "settings": {"robot": {"cell": 1e-5}}}, 422, "by more than a factor of ten"),
     ({"name": "b", "settings": {"recording": {"max_pixels": 10**9}}}, 422, "a limit of the service"),
     ({"name": "b", "settings": {"voxels": {"max_voxels": 10**9}}}, 422, "a limit of the service"),
+    (
+        {"name": "b", "ignore": text(LARGE), "settings": {"recording": {"max_pixels": 10**9}}},
+        422,
+        "ignore: 5000×5000 pixels exceed the limit of 16000000",
+    ),
     ({"name": "b", "seed": -1}, 422, "seed"),
     ({"name": "a"}, 409, "contains a session or other files"),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import pickle
 import shutil
@@ -22,7 +23,7 @@ from caryatid.scene import Scene
 from caryatid.sensing.views import View
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.captures import CameraRecord
-from caryatid.sessions.session import SessionBusyError, SessionConflictError
+from caryatid.sessions.session import SessionBusyError, SessionConflictError, _Unpickler
 
 
 @pytest.fixture
@@ -168,6 +169,15 @@ def test_looking_on_stops_when_a_view_changes_nothing(folder, views):
         assert session.next().stop == "the last view did not change the graph"
 
 
+def test_views_are_counted_since_the_last_report(folder, views):
+    settings = replace(Config(), active=replace(Config().active, max_views=1))
+    with Session.begin(folder, settings, segmentation="labels") as session:
+        session.add(views[0])
+        assert session.next().stop == "maximum of 1 views reached"
+        session.take("o1")
+        assert session.next().stop != "maximum of 1 views reached"
+
+
 def test_undo_goes_back_view_by_view(begun, views, graph_after):
     with Session.open(begun) as session:
         session.add(views[2])
@@ -189,7 +199,10 @@ def test_what_the_robot_reports_stays_and_can_be_taken_back(begun, views):
     graphs = [graph_text(scene.graph), graph_text(scene.removed("o2"))]
     graphs += [graph_text(scene.update(views[2])), graph_text(scene.moved("o1", aside))]
     with Session.open(begun) as session:
-        session.take("o2")
+        for _ in range(2):
+            session.take("o2", number=0)
+        with pytest.raises(SessionConflictError, match="has number 0, but the next report is 1"):
+            session.take("o1", number=0)
         session.add(views[2])
         assert graph_text(session.take("o1", aside)) == graphs[-1]
         before = contents(begun)
@@ -239,6 +252,10 @@ def test_reports_of_views_that_are_gone_are_not_applied_to_others(begun, views):
         session.take("o2")
     shutil.rmtree(begun / "views/000001")
     with pytest.raises(InputError, match="some belong to missing views; restore these views"):
+        Session.open(begun)
+    shutil.rmtree(begun / "reports")
+    (begun / "reports").touch()
+    with pytest.raises(InputError, match=r"reports: cannot be read \(Not a dir.*; restore this folder"):
         Session.open(begun)
 
 
@@ -297,6 +314,16 @@ def test_without_a_usable_snapshot_no_view_is_lost(begun, views, tmp_path, monke
     with Session.open(begun) as session:
         assert graph_text(session.graph) == graph_after(0, 1, 2)
     assert not (tmp_path / "touched").exists()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["io.staging StagedFolder", "config.settings Path", "scene compile_kernels", "graph Support.doubtful"],
+)
+def test_a_snapshot_restores_only_types_of_a_scene(kind):
+    payload = b"\x80\x04ccaryatid." + kind.replace(" ", "\n").encode() + b"\n."
+    with pytest.raises(pickle.UnpicklingError, match="is not part of a scene"):
+        _Unpickler(io.BytesIO(payload)).load()
 
 
 # Disks, deaths, damage

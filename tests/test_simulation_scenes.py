@@ -64,6 +64,14 @@ def write(path: Path, text: str) -> Path:
 # MJCF
 
 
+def test_objects_that_fall_off_or_never_rest_are_warned_of(tmp_path, caplog):
+    beside = '<body name="apple" pos="3 0 0.1"><freejoint/><geom type="sphere" size="0.03"/></body>'
+    load_scene(write(tmp_path / "still.xml", mjcf(TABLE + CUBE)))
+    assert not caplog.messages
+    load_scene(write(tmp_path / "fallen.xml", mjcf(TABLE + CUBE + beside)))
+    assert "fallen.xml: apple fell off the table before the first view" in caplog.text
+
+
 def test_objects_are_the_free_bodies_in_their_order():
     ball = '<body name="ball" pos="0.1 0.2 0.78"><freejoint/><geom type="sphere" size="0.03"/></body>'
     wall = '<geom name="wall" type="box" size="0.03 1 1" pos="0.7 0 1"/>'

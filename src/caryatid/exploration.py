@@ -232,7 +232,7 @@ class Explorer:
             scene.views - 1, source.name, view, scene.labels, scene.graph, scene.cloud, sphere, visited,
             None, None, {"capture": captured} | scene.timings, angle, path, None,
             None if kept else self._robot_pose(),
-            tuple(change for change in scene.changes if change.view == scene.views - 1),
+            scene.new_changes,
         )  # fmt: skip
 
     def plan(self) -> Step:

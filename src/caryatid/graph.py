@@ -216,6 +216,9 @@ class Change:
     view: int
     why: str
 
+    def __str__(self) -> str:
+        return f"{self.object_id} was {self.kind}: {self.why}"
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Grasp:

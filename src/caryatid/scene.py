@@ -29,7 +29,15 @@ from caryatid.runtime.parallel import one_blas_thread
 from caryatid.segmentation.holes import count_holes
 from caryatid.segmentation.observation import Observation, label_image, observe
 from caryatid.segmentation.support_plane import SupportSurface, refitted
-from caryatid.segmentation.view_checks import check_camera, check_centre, check_free, check_place
+from caryatid.segmentation.view_checks import (
+    check_camera,
+    check_centre,
+    check_free,
+    check_masks,
+    check_place,
+    check_range,
+    check_size,
+)
 from caryatid.sensing.registration import ViewRegistration
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
@@ -117,6 +125,11 @@ class Scene(Pictured):
     def changes(self) -> tuple[Change, ...]:
         """Changes of objects since the first view, in order."""
         return self._detector.history
+
+    @property
+    def new_changes(self) -> tuple[Change, ...]:
+        """Changes that the newest view shows, or that were reported since the view before it."""
+        return tuple(change for change in self.changes if change.view >= self.views - 1)
 
     @property
     def cloud(self) -> Cloud:
@@ -364,6 +377,12 @@ class Scene(Pictured):
             if not given:  # masks show what has no depth
                 self._check_holes(observation.view, observation.surface)
         self._check_found(observation, source.name, masks=given)
+        if isinstance(source, View):
+            check_range(source, self.config)
+        if given:
+            check_masks(source, observation, self.config)
+        if not self.views:
+            check_size(source.name, observation.surface, self.config.surface)
         watch.lap("segment")
         observation, moved = self._registered(observation, named)
         watch.lap("register")

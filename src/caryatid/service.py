@@ -36,6 +36,7 @@ from caryatid.config import Config, SegmentationMethod
 from caryatid.config.settings import changed_settings
 from caryatid.errors import CaryatidError, InputError, PlanningError, in_one_line
 from caryatid.geometry.transforms import Array
+from caryatid.graph import Change
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import read_mask
 from caryatid.io.json_files import Numbers
@@ -109,6 +110,7 @@ class SessionAnswer(SessionOptions):
     """A session."""
 
     views: int = Field(description="Number of its views")
+    reports: int = Field(description="Number of its reports")
 
 
 class NewView(Document):
@@ -143,6 +145,7 @@ class ViewAnswer(Document):
         description="Pose [m] after registration, or null while the view waits"
     )
     warnings: list[str] = Field(description="What may be wrong with the view, or why it waits")
+    changes: list[Change] = Field(description="Changes of objects since the previous view, seen or reported")
     graph: dict[str, Any] = Field(description="graph.json")
 
 
@@ -154,12 +157,18 @@ class NewReport(Document):
         None,
         description="The object's motion: rigid transform (4, 4), world frame [m]; null = removed",
     )
+    number: int | None = Field(
+        None,
+        ge=0,
+        description="Number of the report, from 0; makes retries safe: the newest report is not repeated",
+    )
 
 
 class Known(Document):
     """The session after a change."""
 
     views: int = Field(description="Number of views")
+    reports: int = Field(description="Number of reports")
     graph: dict[str, Any] = Field(description="graph.json")
 
 
@@ -280,7 +289,7 @@ class SessionPool:
         self._check_room()
         return self.session(name).add(view, number)
 
-    def take(self, name: str, object_id: str, T: Array | None) -> Session:
+    def take(self, name: str, object_id: str, T: Array | None, number: int | None) -> Session:
         """Report to a session that an object was moved by T (4, 4), or removed; return the session.
 
         Raises:
@@ -288,7 +297,7 @@ class SessionPool:
         """
         self._check_room()
         session = self.session(name)
-        session.take(object_id, T)
+        session.take(object_id, T, number)
         return session
 
     def _check_room(self) -> None:
@@ -362,7 +371,11 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     def described(name: str, session: Session) -> dict[str, Any]:
         b = session.beginning
         chosen = {"segmentation": b.segmentation, "seed": b.seed, "planner": b.planner}
-        return {"name": name, "views": session.views} | chosen
+        return {"name": name, "views": session.views, "reports": session.reports} | chosen
+
+    def state_of(session: Session) -> dict[str, Any]:
+        counts = {"views": session.views, "reports": session.reports}
+        return counts | {"graph": graph_to_json(session.graph)}
 
     @app.get("/sessions")
     @queued
@@ -377,7 +390,7 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         config = changed_settings(pool.config, given.settings, "settings")
         options = given.model_dump(include={"segmentation", "seed", "planner"})
         if given.ignore is not None:
-            options["ignore"] = read_mask(given.ignore, "ignore", config.recording.max_pixels)
+            options["ignore"] = read_mask(given.ignore, "ignore", pool.config.recording.max_pixels)
         return described(given.name, pool.begin(given.name, config, **options))
 
     @app.get("/sessions/{name}", response_model=SessionAnswer)
@@ -396,15 +409,15 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @queued
     def report_change(name: SessionName, given: NewReport) -> Any:
         """Report an object that was removed or moved; once this returns, the report is safe on disk."""
-        session = pool.take(name, given.object, given.T)
-        return {"views": session.views, "graph": graph_to_json(session.graph)}
+        return state_of(pool.take(name, given.object, given.T, given.number))
 
     @app.delete("/sessions/{name}/views/last", response_model=Known)
     @queued
     def undo_view(name: SessionName) -> Any:
         """Undo the last view, or the last report after it."""
         session = pool.session(name)
-        return {"views": session.undo(), "graph": graph_to_json(session.graph)}
+        session.undo()
+        return state_of(session)
 
     @app.get("/sessions/{name}/graph")
     @queued

@@ -12,7 +12,7 @@ from types import NoneType
 import numpy as np
 
 from caryatid.config import Config, NoiseModel, SegmentationMethod
-from caryatid.errors import InputError, NoSurfaceError, WrongViewError, check_type
+from caryatid.errors import InputError, NoSurfaceError, PerceptionError, WrongViewError, check_type
 from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
@@ -242,7 +242,7 @@ def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:
             if not left:
                 raise
             log.warning(KEPT, error)
-        except WrongViewError as error:
+        except (WrongViewError, PerceptionError) as error:
             if explorer.step is None:
                 raise
             log.warning(LEFT_OUT, error)

@@ -318,7 +318,7 @@ class Exploration:
 
     def _published(self, scene: Scene) -> Any:
         """Publish the graph and its markers, and return the graph's message."""
-        graph = messages.graph_message(self._ros.make, scene.graph, self._header)
+        graph = messages.graph_message(self._ros.make, scene.graph, scene.new_changes, self._header)
         self._ros.publish("support_graph", graph)
         self._ros.publish("markers", messages.markers_message(self._ros.make, scene.graph, self._header))
         return graph
@@ -326,6 +326,8 @@ class Exploration:
     def _result(self, message: str, views: int) -> Any:
         fields: dict[str, Any] = {"message": message, "views": views}
         if self._header is not None and self._explorer is not None:
-            graph = self._explorer.scene.graph
-            fields["graph"] = messages.graph_message(self._ros.make, graph, self._header)
+            scene = self._explorer.scene
+            fields["graph"] = messages.graph_message(
+                self._ros.make, scene.graph, scene.new_changes, self._header
+            )
         return self._ros.make("caryatid_msgs/action/Explore/Result", **fields)

@@ -5,7 +5,7 @@ Messages are made by a function `make(name, **fields)`, so that other message ty
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 from importlib import import_module
 from typing import Any
@@ -18,7 +18,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SceneObject, Support, SupportGraph
+from caryatid.graph import Change, Grasp, SceneObject, Support, SupportGraph
 from caryatid.io.bags import decode_colour, decode_depth
 from caryatid.manipulation.order import Order
 from caryatid.planning.decision import Decision
@@ -91,11 +91,14 @@ def pose_message(make: Make, T: Array) -> Any:
     return make("geometry_msgs/msg/Pose", position=_point(make, T[:3, 3]), orientation=orientation)
 
 
-def graph_message(make: Make, graph: SupportGraph, header: Any) -> Any:
+def graph_message(make: Make, graph: SupportGraph, changes: Sequence[Change], header: Any) -> Any:
     """A SupportGraph, with the time of the newest image and the world frame in its header."""
-    objects = [_object(make, o) for o in graph.objects]
-    supports = [_support(make, s) for s in graph.supports]
-    return make("caryatid_msgs/msg/SupportGraph", header=header, objects=objects, supports=supports)
+    return make(
+        "caryatid_msgs/msg/SupportGraph", header=header,
+        objects=[_object(make, o) for o in graph.objects],
+        supports=[_support(make, s) for s in graph.supports],
+        changes=[_change(make, c) for c in changes],
+    )  # fmt: skip
 
 
 def _object(make: Make, o: SceneObject) -> Any:
@@ -116,6 +119,10 @@ def _support(make: Make, s: Support) -> Any:
     )  # fmt: skip
 
 
+def _change(make: Make, c: Change) -> Any:
+    return make("caryatid_msgs/msg/Change", kind=c.kind, object=c.object_id, view=c.view, why=c.why)
+
+
 def decision_message(make: Make, decision: Decision, header: Any) -> Any:
     """A Decision, with the next camera pose in the frame of the header."""
     pose = pose_message(make, decision.T_world_camera)
@@ -132,9 +139,18 @@ def lift_messages(make: Make, order: Order) -> list[Any]:
         make(
             "caryatid_msgs/msg/Lift",
             object=s.object_id, hold=list(s.hold), risk=float(s.risk), safe=bool(s.safe), why=s.why,
+            grasp=[] if s.grasp is None else [_grasp(make, s.grasp)],
         )
         for s in order.steps
     ]  # fmt: skip
+
+
+def _grasp(make: Make, grasp: Grasp) -> Any:
+    return make(
+        "caryatid_msgs/msg/Grasp", pose=pose_message(make, grasp.T_world_gripper), width=float(grasp.width),
+        travel=float(grasp.travel),
+        seen_free=float("nan") if grasp.seen_free is None else float(grasp.seen_free),
+    )  # fmt: skip
 
 
 def markers_message(make: Make, graph: SupportGraph, header: Any) -> Any:

@@ -82,6 +82,8 @@ class Output(logging.Handler):
 
         f1 = "" if score is None else f", F1 {score.f1:.3f}"
         self.say(f"view {step.index + 1}: {census(step.graph)}{f1} ({turn(step.timings):.1f} s)")
+        for change in step.changes:
+            self.say(f"  {change}")
         for line in changes(before, step.graph):
             kind, _, items = line.partition(": ")
             self.say(f"  {kind}: " + items.replace(", ", "\n" + " " * (len(kind) + 4)))

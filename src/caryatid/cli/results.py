@@ -10,10 +10,7 @@ import tyro
 
 from caryatid.cli import options
 from caryatid.config.choices import ExportFormat, GripperKind
-from caryatid.errors import InputError
 
-OBJECT = 20_000
-"""Maximum size of an object with its supports in graph.json [bytes]; a box has 700."""
 Topic = Annotated[str | None, options.shown("TOPIC")]
 
 
@@ -199,13 +196,7 @@ class Export(options.Command):
         from caryatid.viz.tables import census
 
         config, format_ = self.settings.read(), format_of(self.out, self.format)
-        file = self.run if self.run.suffix == ".json" else self.run / "graph.json"
-        size = file.stat().st_size if file.is_file() else 0
-        if size > OBJECT * config.export.max_objects:
-            most = f"export.max_objects = {config.export.max_objects:,}"
-            remedy = "raise that setting; reading takes ten times as much memory"
-            raise InputError(file, f"{size / 1e6:,.0f} MB is too large for {most}", remedy)
-        graph = read_graph(file) if file is self.run else read_run(self.run).graph
+        graph = read_graph(self.run) if self.run.suffix == ".json" else read_run(self.run).graph
         export_graph(graph, self.out, config.export)
         self.output.result({"file": str(self.out), "format": format_}, "")
         self.output.say(f"{self.out}: {format_}, {census(graph)}")
@@ -227,8 +218,6 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
     config, record = read_config(run), run.record
     settings = {"source": record["source"], "seed": record["seed"]} | record["options"]
     settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
-    if record.get("warnings"):
-        settings["warnings"] = "; ".join(record["warnings"])
     made_by = f"caryatid {record.get('versions', {}).get('caryatid', '')}".rstrip()
     about = [record.get("conditions"), made_by, record.get("date", "")[:16].replace("T", " ")]
     report = make_report(
@@ -238,6 +227,7 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
         settings=settings,
         scores=record.get("scores", ()),
         strip=read_lifts(folder),
+        warnings=record.get("warnings", ()),
         config=config.report,
     )
     files = {} if pdf is None else {pdf: render_pdf(report)}

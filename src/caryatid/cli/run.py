@@ -343,7 +343,8 @@ class Clear(options.ExploringCommand):
             reason = f"was not found in {count_of(last.index + 1, 'view')}"
             raise InputError(f"--goal {self.goal}", reason, f"objects found: {', '.join(found) or 'none'}")
         harmed = sorted({body for lift in lifts for body in lift["disturbed"]})
-        reached = any(lift["object"] == self.goal for lift in lifts) if self.goal else not hands.left
+        gone = {lift["object"] for lift in lifts if lift["body"] is not None}
+        reached = self.goal in gone if self.goal else not hands.left
         taken = [{name: value for name, value in lift.items() if name != "state"} for lift in lifts]
         document = {"run": str(self.out), "success": reached and not harmed, "stop": last.stop}
         document |= {"views": last.index + 1, "steps": taken, "left": hands.left, "warnings": output.warnings}
@@ -406,7 +407,7 @@ def _about(command: RunCommand | Clear) -> dict[str, Any]:
     """Entries of run.json about the command."""
     names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands")
     options = {name: getattr(command, name) for name in names if hasattr(command, name)}
-    options["preset"] = command.settings.preset
+    options |= {"preset": command.settings.preset, "masks": command.settings.masks}
     if isinstance(command, Explore | Clear):
         options["planner"] = command.chosen_planner
     if isinstance(command, Explore):

@@ -108,8 +108,8 @@ class Add(SessionStep):
             images = {"depth": self.depth, "rgb": self.rgb, "labels": self.labels}
             capture = Capture.from_files(images, self.camera, limits)
             added = session.add(capture, self.number)
-        for warning in added.warnings:
-            self.output.say(warning)
+        for line in (*added.warnings, *map(str, added.changes)):
+            self.output.say(line)
         news = "" if added.changed else ", graph unchanged"
         self.show(added.to_json(), f"view {added.number + 1}: {census(added.graph)}{news}")
 
@@ -173,6 +173,8 @@ class Take(SessionStep):
     """ID of the object."""
     moved: Annotated[Path | None, options.shown("T.json")] = None
     """The object's motion. If omitted, the object was removed."""
+    number: Annotated[int | None, options.shown("N")] = None
+    """Number of the report, from 0; makes a repeated command safe: the newest report is not repeated."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import kept
@@ -182,7 +184,7 @@ class Take(SessionStep):
 
         T = None if self.moved is None else parse_json(Moved, read_json(self.moved), self.moved).T
         with kept(KEPT), Session.open(self.folder) as session:
-            session.take(self.object, T)
+            session.take(self.object, T, self.number)
             self.show_changed(session, f"{self.object} {'removed' if T is None else 'moved'}")
 
 

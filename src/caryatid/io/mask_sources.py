@@ -90,12 +90,12 @@ class OnnxMasks:
     """
 
     def __init__(self, path: Path, config: Config, seed: int = 0) -> None:
-        import onnxruntime
+        from caryatid.segmentation.affinities import open_network
 
         if not path.is_file():
             raise InputError(path, "the file is missing", "give an ONNX model")
         try:
-            self._session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+            self._session = open_network(path)
         except Exception as error:  # onnxruntime's own exceptions have no common base
             reason = f"onnxruntime cannot read it ({' '.join(str(error).split())})"
             raise InputError(path, reason, "export it again") from None

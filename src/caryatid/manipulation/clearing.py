@@ -41,7 +41,7 @@ def clear(
         goal: Id of the object to reach; None = remove all.
         hands: 2 if another hand can hold one object, else 1.
         threads: Number of parallel rehearsals.
-        reachable: Which gripper poses the arm reaches; None = all.
+        reachable: Which gripper poses (N, 4, 4), in the world frame, the arm reaches; None = all.
         past: Steps of a run to continue; their views are reused, and nothing is removed again.
 
     Yields:
@@ -100,14 +100,16 @@ def _lift(
     explorer.goal = None if safe is None or not found else goal or safe.object_id
     step = explorer.plan()
     # While no lift is safe, a view that shows little is worth its path too.
-    enough = explorer.reason_to_stop() if safe or not found else step.stop
+    unsafe = safe is None and (found or lift is not None)
+    enough = step.stop if unsafe else explorer.reason_to_stop()
     reason = used_up(views, scene.config.active) or enough
     if reason is None:
         return None, None
     if safe is not None:
         return safe, None
-    unsafe = None if lift is None else f"no lift is safe: lifting {lift.object_id} {lift.why}"
-    return None, unsafe or f"{reason}; {missing}"
+    if lift is not None:
+        return None, f"no lift is safe: lifting {lift.object_id} {lift.why}"
+    return None, f"{reason}; {missing}"
 
 
 def _repeat(explorer: Explorer, step: Step) -> None:

@@ -61,7 +61,8 @@ def find_grasp(
         gripper: The gripper.
         friction: Coefficient of friction between fingers and object [1].
         voxels: What was seen empty; None = only known shapes obstruct.
-        reachable: Which gripper poses the arm reaches; None = all.
+        reachable: Which gripper poses (N, 4, 4), in the world frame, the arm reaches; None = all. The arm has
+            to reach the grasp, the start of its approach, and the end of the lift.
 
     Returns:
         The grasp, or why there is none.
@@ -72,7 +73,10 @@ def find_grasp(
         return Blocked((), "no side fits between the fingers" if jaw else "no side is flat enough")
     poses, widths = np.array([T for T, _ in found]), np.array([width for _, width in found])
     if reachable is not None:
-        reached = reachable(poses)
+        before, after = poses.copy(), poses.copy()
+        before[:, :3, 3] -= gripper.travel * poses[:, :3, 2]
+        after[:, 2, 3] += gripper.travel
+        reached = reachable(poses) & reachable(before) & reachable(after)
         poses, widths = poses[reached], widths[reached]
         if not len(poses):
             return Blocked((), "every grasp is out of reach")

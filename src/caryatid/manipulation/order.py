@@ -97,7 +97,7 @@ def plan_order(
         seed: Seed of the rehearsals.
         threads: Number of parallel rehearsals.
         voxels: What was seen empty, for the gripper's path; None = only known shapes are in its way.
-        reachable: Which gripper poses the arm reaches; None = all.
+        reachable: Which gripper poses (N, 4, 4), in the world frame, the arm reaches; None = all.
 
     Raises:
         InputError: The graph has no support surface, no objects, or more than `rehearsal.max_objects`; or
@@ -355,9 +355,12 @@ class _Rehearsal:
             rng = np.random.default_rng([self._seed, number])
             self._bodies.append(_drawn_bodies(self.graph, number, self._config, rng))
         missing = range(len(drawn), min(numbers.stop, self._config.rehearsal.draws))
-        with ThreadPoolExecutor(self._threads) as pool:
+        pool = ThreadPoolExecutor(self._threads)
+        try:
             drawn += pool.map(partial(self._draw, group), missing)
             return list(pool.map(do, drawn[numbers]))
+        finally:  # `with` would make Ctrl-C wait for the rehearsals
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _groups(shapes: Sequence[Shape], gap: float) -> NDArray[np.int32]:
@@ -384,9 +387,10 @@ class _DrawnScene:
         spec.option.timestep = 0.004
         if table is not None:
             _add_table(spec, table)
-        for name, body in bodies.items():
+        names = [str(number) for number in range(len(bodies))]  # MuJoCo does not allow every id as a name
+        for name, body in zip(names, bodies.values(), strict=True):
             add_body(spec, name, body)
-        self._lifting = Lifting(spec, self._ids)
+        self._lifting = Lifting(spec, names)
         seen, seconds = self._lifting.start, self._lifting.longest(self._lifting.start, config)
         self.unstable, moved = np.zeros(len(bodies), dtype=np.bool_), np.ones(len(bodies), dtype=np.bool_)
         while moved.any():

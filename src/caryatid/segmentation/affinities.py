@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -105,8 +106,12 @@ def features(depth: Image, rgb: NDArray[np.uint8] | None, K: Array, up_camera: A
 @cache
 def _session() -> Any:
     """The network, loaded once."""
+    return open_network(files("caryatid.segmentation").joinpath(MODEL).read_bytes())
+
+
+def open_network(model: bytes | Path) -> Any:
+    """Open an ONNX model that runs on as many threads as caryatid may use, which wait without spinning."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = cores()
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    model = files("caryatid.segmentation").joinpath(MODEL).read_bytes()
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])

@@ -1,4 +1,4 @@
-"""Checks that reject wrong views: by their camera, and against earlier views."""
+"""Checks that reject wrong views, or warn of them: by camera, by content, and against earlier views."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import logging
 
 import numpy as np
 
-from caryatid.config import Config
+from caryatid.config import Config, SurfaceConfig
 from caryatid.errors import WrongViewError
+from caryatid.geometry import polygons
 from caryatid.geometry.transforms import Array
+from caryatid.segmentation.observation import Observation
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
 from caryatid.sensing.voxel_map import FREE, VoxelMap
@@ -54,6 +56,36 @@ def check_centre(view: View) -> None:
     if (np.abs(centre - (size - 1) / 2.0) > size / 5.0).any():
         text = "%s: K has its principal point at (%.0f, %.0f) in %d×%d pixels; is K for another resolution?"
         log.warning(text, view.name, *centre, *size)
+
+
+def check_range(view: View, config: Config) -> None:
+    """Warn of a surface as large as an object that is too near for the camera's range."""
+    near = view.depth[view.valid & (view.depth < config.cloud.min_depth)]
+    if ((near / view.K[0, 0]) ** 2).sum() >= config.segmentation.min_area:
+        text = "%s: %d readings nearer than cloud.min_depth = %g m are ignored"
+        log.warning(text, view.name, len(near), config.cloud.min_depth)
+
+
+def check_masks(source: View | Cloud, observation: Observation, config: Config) -> None:
+    """Warn of masks of a view that are as large as an object and have too few points for a shape."""
+    view = observation.view
+    if view is None or source.labels is None or not isinstance(source, View):
+        return
+    pixels = np.bincount(source.labels.ravel())
+    points = np.bincount(observation.labels, minlength=len(pixels))[: len(pixels)]
+    distance = float(np.linalg.norm(view.pose[:3, 3] - observation.surface.point_world))
+    large = pixels * (distance / source.K[0, 0]) ** 2 >= config.segmentation.min_area
+    lost = np.flatnonzero(large & (points < config.fit.min_points))
+    if names := ", ".join(str(label) for label in lost if label != 0):
+        log.warning("%s: too few depth readings in mask %s; its object is missed", view.name, names)
+
+
+def check_size(name: str, surface: SupportSurface, config: SurfaceConfig) -> None:
+    """Warn of a support surface that is smaller than a table, such as the side of a box if z is not up."""
+    area = polygons.area(np.ascontiguousarray(surface.outline_world[:, :2])) / surface.normal_world[2]
+    if area < config.min_area:
+        remedy = "if it is not the table, show more of the table or use --level"
+        log.warning("%s: the support surface has only %.3f m²; %s", name, area, remedy)
 
 
 def check_place(

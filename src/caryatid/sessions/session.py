@@ -36,7 +36,7 @@ from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import given_candidates, next_best_view, reason_to_stop, used_up
 from caryatid.geometry.transforms import Array, as_rigid
-from caryatid.graph import SupportGraph
+from caryatid.graph import Change, SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.images import png, read_mask
 from caryatid.io.json_files import Numbers, parse_json, read_json
@@ -71,7 +71,9 @@ KNOWN: Final = {
     ("numpy._core.multiarray", "scalar"),
     ("numpy._core.numeric", "_frombuffer"),
 }
-"""Types that a snapshot may contain besides classes of caryatid; a foreign session cannot run code."""
+"""What a snapshot may contain of other packages."""
+ORIGINS: Final = {"config", "geometry", "graph", "objects", "scene", "segmentation", "sensing"}
+"""Parts of caryatid whose types it may contain. No other type is restored: a foreign session runs no code."""
 
 
 class SessionConflictError(InputError):
@@ -138,6 +140,7 @@ class Added:
         changed: Whether it changed the graph.
         T_world_camera: Registered camera pose (4, 4), or None while the view waits.
         warnings: What may be wrong with the view, or why it waits; one sentence each.
+        changes: Changes of objects since the previous view, seen or reported.
     """
 
     number: int
@@ -145,12 +148,14 @@ class Added:
     changed: bool
     T_world_camera: Array | None = None
     warnings: tuple[str, ...] = ()
+    changes: tuple[Change, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer of `caryatid session add` and of the service."""
         pose = None if self.T_world_camera is None else self.T_world_camera.tolist()
         document = {"view": self.number, "changed": self.changed, "T_world_camera": pose}
-        return document | {"warnings": list(self.warnings), "graph": graph_to_json(self.graph)}
+        known = {"warnings": list(self.warnings), "changes": [asdict(change) for change in self.changes]}
+        return document | known | {"graph": graph_to_json(self.graph)}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -325,6 +330,11 @@ class Session:
         return len(self._records)
 
     @property
+    def reports(self) -> int:
+        """Number of reports."""
+        return len(self._events) - self.views
+
+    @property
     def graph(self) -> SupportGraph:
         """The fused support graph."""
         return self.scene.graph
@@ -364,28 +374,37 @@ class Session:
         self._warnings = warnings
         return self._added()
 
-    def take(self, object_id: str, T: ArrayLike | None = None) -> SupportGraph:
+    def take(self, object_id: str, T: ArrayLike | None = None, number: int | None = None) -> SupportGraph:
         """Report that the robot removed or moved an object; once this returns, the report is on disk.
 
         Args:
             object_id: Id of the object.
             T: The object's motion as a rigid transform (4, 4) in the world frame; None = removed.
+            number: Number of the report, from 0; None = the next one. The newest report is not repeated, so a
+                client that missed the answer can send it again.
 
         Returns:
             The graph without the object, or with it at its new pose.
 
         Raises:
+            SessionConflictError: The report would get another number.
             InputError: The object is unknown, or T is not a rigid transform; the session does not change.
         """
         self._check_writable()
         report = Report(object_id, self.views, None if T is None else as_rigid(T, "T"))
+        if number is not None and number != self.reports:
+            newest = self._events[-1] if 0 <= number == self.reports - 1 else None
+            if not isinstance(newest, Report) or newest.to_json() != report.to_json():
+                reason = f"has number {number}, but the next report is {self.reports}"
+                raise SessionConflictError("report", reason)
+            return self.graph
         scene = self.scene.copy()
         report.apply(scene)
         graph_text(scene.graph)
         with write_errors(self.path):
             (self.path / "reports").mkdir(exist_ok=True)
             sync(self.path)
-        write_file(self._report(len(self._events) - self.views), report.to_json(), durable=True)
+        write_file(self._report(self.reports), report.to_json(), durable=True)
         self._keep(report, scene)
         return self.graph
 
@@ -426,7 +445,8 @@ class Session:
         state = PlanningState(
             self.scene.graph, sphere, self.scene.voxels, visited, reachable, self.scene.config.active
         )
-        stop = used_up(len(visited), state.config)
+        reports = [number for number, event in enumerate(self._events, start=1) if isinstance(event, Report)]
+        stop = used_up(len(self._events) - max(reports, default=0), state.config)
         stop = stop or reason_to_stop(state, self.scene.changed, planner, decision)
         return NextView(self.views, decision, stop)
 
@@ -453,8 +473,9 @@ class Session:
         return self.views
 
     def _added(self) -> Added:
-        pose = None if self.scene.waiting else self.scene.T_world_camera
-        return Added(self.views - 1, self.graph, self.scene.changed, pose, tuple(self._warnings))
+        scene, warnings = self.scene, tuple(self._warnings)
+        pose, changes = (None, ()) if scene.waiting else (scene.T_world_camera, scene.new_changes)
+        return Added(self.views - 1, self.graph, scene.changed, pose, warnings, changes)
 
     def _check_writable(self) -> None:
         if self._lock is None:
@@ -480,9 +501,8 @@ class Session:
         return self.path / "reports" / f"{number:06d}.json"
 
     def _kept(self) -> list[Event]:
-        with read_errors(self.path / "views", "restore this folder"):
-            folders = sorted(p for p in (self.path / "views").iterdir() if p.name[0].isdigit())
-        files = sorted(p for p in (self.path / "reports").glob("*.json") if p.name[0].isdigit())
+        folders, reported = _numbered(self.path / "views"), self.path / "reports"
+        files = _numbered(reported) if reported.exists() else []
         for found, place, what in ((folders, self._folder, "view"), (files, self._report, "report")):
             for number, path in enumerate(found):
                 if path != place(number):
@@ -556,6 +576,12 @@ class Session:
         return hashlib.sha256(made_of.encode() + b"\0" + payload).digest()
 
 
+def _numbered(folder: Path) -> list[Path]:
+    """The numbered files and folders in a folder, in order."""
+    with read_errors(folder, "restore this folder"):
+        return sorted(p for p in folder.iterdir() if p.name[0].isdigit())
+
+
 def _locked(path: Path) -> FileLock:
     """Lock out other writers until the lock is released or this process ends."""
     lock = FileLock(path, timeout=0, thread_local=False)
@@ -569,13 +595,13 @@ def _locked(path: Path) -> FileLock:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Restores only arrays and objects of caryatid."""
+    """Restores only arrays and the parts of a scene."""
 
     def find_class(self, module: str, name: str) -> Any:
-        known = (module, name) in KNOWN
-        if known or (module.split(".")[0] == "caryatid" and "." not in name):
+        known, origin = (module, name) in KNOWN, module.split(".")[:2]
+        if known or (origin[0] == "caryatid" and origin[-1] in ORIGINS):
             found = super().find_class(module, name)
-            if known or isinstance(found, type):
+            if known or (isinstance(found, type) and found.__module__ == module):
                 return found
         raise pickle.UnpicklingError(f"{module}.{name} is not part of a scene")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping
 from contextlib import suppress
@@ -20,13 +21,17 @@ from caryatid.simulation.generation import SIZES, GeneratedKind, generate
 from caryatid.simulation.world import (
     Body,
     SimulatedScene,
+    bounds,
     box,
     build_spec,
     cylinder,
     mujoco_warnings_ignored,
     scene_from_spec,
     sphere,
+    table_centre,
 )
+
+log = logging.getLogger(__name__)
 
 DESIGNED: Final[Mapping[str, tuple[Body, ...]]] = {
     "tower": (
@@ -152,7 +157,13 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
         reason = " ".join(str(error).split())
         raise InputError(path, f"not an MJCF file ({reason})", "correct the XML") from None
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
-    return scene_from_spec(spec, name or path.stem, str(path), config)
+    scene = scene_from_spec(spec, name or path.stem, str(path), config)
+    floor = table_centre(scene)[2]
+    if fallen := [body for label, body in scene.object_bodies.items() if bounds(scene, label)[1][2] < floor]:
+        log.warning("%s: %s fell off the table before the first view", path, ", ".join(fallen))
+    if not scene.at_rest:
+        log.warning("%s: the scene still moves; its ground truth may change between views", path)
+    return scene
 
 
 def _check_sizes(path: Path, config: PhysicsConfig) -> None:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from caryatid.config import Config, ReportConfig
 from caryatid.geometry.transforms import Array
-from caryatid.graph import DOUBTFUL, Change, SupportGraph
+from caryatid.graph import DOUBTFUL, SupportGraph
 from caryatid.manipulation.dismantling import Taken
 from caryatid.sensing.views import Cloud, View
 from caryatid.simulation.camera import intrinsics, render
@@ -125,6 +125,7 @@ def make_report(
     settings: Mapping[str, object] | None = None,
     scores: Sequence[Mapping[str, Any]] = (),
     strip: Sequence[Figure] = (),
+    warnings: Sequence[str] = (),
     config: ReportConfig | None = None,
 ) -> Report:
     """Make the report of a run; steps are drawn one by one, to keep only one image and cloud in memory.
@@ -136,6 +137,7 @@ def make_report(
         settings: Names and values of the run's settings.
         scores: Values of the `Score` after each view by name; empty without ground truth.
         strip: Pictures of the lifts, in order.
+        warnings: What may be wrong with the views, one sentence each.
         config: Sizes of the pictures.
 
     Raises:
@@ -170,7 +172,8 @@ def make_report(
         raise ValueError(f"{len(scores)} scores for {len(seen)} views")
     removed = f"{count_of(len(strip), 'object')} removed. " if strip else ""
     sections = [*_answer(last, shown, len(seen), scores[-1] if scores else None, width, removed)]
-    facts = [(f"Before view {step.index + 1}", _in_words(change)) for step in seen for change in step.changes]
+    facts = [("Warning", sentence(warning)) for warning in warnings]
+    facts += [(f"Before view {step.index + 1}", str(change)) for step in seen for change in step.changes]
     facts += [("Finished", sentence(last.stop))] if last.stop else []
     pictures = [*contacts * (len(contacts) > 1), *_charts(seen, scores)]
     if pictures or facts:
@@ -184,10 +187,6 @@ def make_report(
     source = Table.of("Source and options", ("name", "value"), named)
     sections.append(Section("Settings", tables=[source], folded=True))
     return Report(title, about, sections)
-
-
-def _in_words(change: Change) -> str:
-    return f"{change.object_id} was {change.kind}: {change.why}"
 
 
 def _answer(
@@ -259,7 +258,7 @@ def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> lis
 def _view(step: Step, news: str, f1: str, width: int) -> Section:
     """A view: its counts, its score and what it changed, pictures, what comes next, tables."""
     decision = step.decision
-    facts, tables = [("Before this view", _in_words(change)) for change in step.changes], []
+    facts, tables = [("Before this view", str(change)) for change in step.changes], []
     if decision is not None:
         scores = (
             f"saliency {decision.saliency:.2f}, path cost {decision.cost:.2f}, score {decision.score:.2f}"
