@@ -210,7 +210,7 @@ def test_masks_that_would_not_be_used_are_refused():
 
 
 def written(folder, steps):
-    with RunWriter(folder, FEW_VIEWS, {}) as writer:
+    with RunWriter(folder, FEW_VIEWS, {"source": "tower", "seed": 0, "options": {}}) as writer:
         for step in steps:
             writer.add(step)
     return read_run(folder)

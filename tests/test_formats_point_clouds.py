@@ -148,6 +148,7 @@ GIGABYTES = struct.pack("<II", 100, 10**8 * DTYPE.itemsize) + bytes(100)
         (None, {"TYPE": "U F F U U"}, "floating-point"),
         (None, {"POINTS": 0, "WIDTH": 0}, "POINTS 0"),
         (None, {"VIEWPOINT": "0 0 0"}, "VIEWPOINT"),
+        (None, {"COUNT": "1 1 1 1 997"}, "the sum of COUNT, 1001, exceeds 1000"),
         (None, {"DATA": None}, "no DATA line"),
         (GIGABYTES, {"DATA": "binary_compressed", "POINTS": 10**8, "WIDTH": 10**8}, "broken file or header"),
         (b"1 2 3 4 5\n1 2\n", {"DATA": "ascii", "POINTS": 2, "WIDTH": 2}, "2 were found"),

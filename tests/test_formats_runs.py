@@ -21,12 +21,14 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Sphere
 from caryatid.graph import SceneObject, SupportGraph
+from caryatid.io.staging import write_file
 from caryatid.planning.decision import Decision
 from caryatid.sensing.views import View
 from caryatid.steps import RunWriter, read_run
 
 T = transforms.rigid(np.eye(3), (0.1, 0.2, 1.5))
 K = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
+ABOUT = {"source": "tower", "seed": 7, "options": {}}
 LABELS = np.zeros((6, 8), np.int32)
 LABELS[2:4, 1:3], LABELS[5] = 300, 65535
 
@@ -41,7 +43,11 @@ def step(count=1, labels=LABELS, name="a"):
 
 
 def writer(folder, seed=7):
-    return RunWriter(folder, Config(), {"seed": seed})
+    return RunWriter(folder, Config(), ABOUT | {"seed": seed})
+
+
+def scored(f1):
+    return {"f1": f1, "precision": 0.5, "recall": 0.5}
 
 
 def write_run(folder, views=2, seed=7, labels=LABELS):
@@ -49,7 +55,7 @@ def write_run(folder, views=2, seed=7, labels=LABELS):
     with writer(folder, seed) as run:
         for index in range(views):
             run.add(
-                replace(step(index + 1, labels, f"scene/{index:06d}"), view=view), {"f1": np.float64(0.25)}
+                replace(step(index + 1, labels, f"scene/{index:06d}"), view=view), scored(np.float64(0.25))
             )
         run.files["report.html"] = "<html>σ</html>".encode()
 
@@ -59,7 +65,7 @@ def test_a_run_is_read_back_and_laid_out_as_documented(tmp_path):
     write_run(folder)
     run = read_run(folder)
     assert run.record["seed"] == 7
-    assert run.record["scores"] == [{"f1": 0.25}] * 2
+    assert run.record["scores"] == [scored(0.25)] * 2
     assert run.record["settings"]["active"]["max_views"] == Config().active.max_views
     assert [told["view"] for told in run.record["steps"]] == [0, 0]
     assert "caryatid" in run.record["versions"]
@@ -156,9 +162,14 @@ def test_what_a_killed_process_left_is_recovered_or_removed(tmp_path):
     (tmp_path / "RUN").rename(tmp_path / f".partial-RUN-{dead.pid}-0123abcd-replaced")
     (tmp_path / f".partial-RUN-{dead.pid}-0123abcd").mkdir()
     (tmp_path / f".partial-RUN-{os.getpid()}-0123abcd").mkdir()
+    assert read_run(tmp_path / "RUN").record["seed"] == 1
+    left = {"RUN", f".partial-RUN-{os.getpid()}-0123abcd"}
+    assert {p.name for p in tmp_path.iterdir()} == left
+    (tmp_path / f".partial-RUN-{dead.pid}-4567cdef").mkdir()
+    (tmp_path / f".partial-a.pdf-{dead.pid}-0123abcd").touch()
     with writer(tmp_path / "RUN", seed=2):
-        assert read_run(tmp_path / "RUN").record["seed"] == 1
-    assert {p.name for p in tmp_path.iterdir()} == {"RUN", f".partial-RUN-{os.getpid()}-0123abcd"}
+        write_file(tmp_path / "a.pdf", b"%PDF")
+    assert {p.name for p in tmp_path.iterdir()} == left | {"a.pdf"}
 
 
 @pytest.mark.parametrize("name", ["run.json", "thesis.tex"])
@@ -175,9 +186,9 @@ def test_a_folder_without_a_run_is_never_touched(tmp_path, name):
 def test_a_continued_run_keeps_its_scores(tmp_path):
     going_on = replace(step(), decision=Decision(T, 0, 0.0, 0.0, 0.0, "more to see"))
     for last, f1 in ((going_on, 0.25), (step(2), 0.5)):
-        with RunWriter(tmp_path / "RUN", Config(), {}, stepwise=True) as run:
-            run.add(last, {"f1": f1})
-    assert read_run(tmp_path / "RUN").record["scores"] == [{"f1": 0.25}, {"f1": 0.5}]
+        with RunWriter(tmp_path / "RUN", Config(), ABOUT, stepwise=True) as run:
+            run.add(last, scored(f1))
+    assert read_run(tmp_path / "RUN").record["scores"] == [scored(0.25), scored(0.5)]
 
 
 def test_files_and_empty_folders_in_the_way(tmp_path):
@@ -187,6 +198,11 @@ def test_files_and_empty_folders_in_the_way(tmp_path):
     with pytest.raises(InputError, match="file/RUN"):
         writer(tmp_path / "file" / "RUN")
     assert (tmp_path / "file").read_text() == "kept"
+    (tmp_path / "loop").symlink_to("loop")
+    with refusal("loop", "not a directory"):
+        writer(tmp_path / "loop")
+    with refusal("loop/RUN", "cannot be written"):
+        writer(tmp_path / "loop/RUN")
     (tmp_path / "RUN").mkdir()
     write_run(tmp_path / "RUN")
     assert len(read_run(tmp_path / "RUN").views) == 2
@@ -217,12 +233,23 @@ def test_a_full_or_read_only_disk_is_a_clear_error_and_nothing_is_left(
     assert list(tmp_path.iterdir()) == []
 
 
+RECORD = ABOUT | {"format": "caryatid/run", "version": 2, "views": 2}
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
         ("run.json", b'{"format": "other"}', "'format' is \"other\": must be 'caryatid/run'"),
         ("run.json", b'{"format": "caryatid/run", "version": 3, "views": 1}', "must be 1 or 2"),
         ("run.json", b'{"format": "caryatid/run", "version": 2, "views": 0}', "'views' is 0"),
+        ("run.json", b'{"format": "caryatid/run", "version": 2, "views": 2}', "'source' is missing"),
+        ("run.json", json.dumps(RECORD | {"source": 3}).encode(), "'source' is 3"),
+        ("run.json", json.dumps(RECORD | {"seed": "x"}).encode(), "'seed' is \"x\""),
+        ("run.json", json.dumps(RECORD | {"options": []}).encode(), "'options' is []"),
+        ("run.json", json.dumps(RECORD | {"warnings": [1]}).encode(), "warnings: '0' is 1"),
+        ("run.json", json.dumps(RECORD | {"date": 2026}).encode(), "'date' is 2026"),
+        ("run.json", json.dumps(RECORD | {"scores": [{}, {}]}).encode(), "scores.0: the key 'f1' is missing"),
+        ("run.json", json.dumps(RECORD | {"scores": [scored(1.0)]}).encode(), "the number of scores, 1"),
         ("graph.json", b"{}", "'format' is missing"),
         ("views/01/graph.json", None, "missing"),
         ("views/01/view.json", b"{}", "'name' is missing"),

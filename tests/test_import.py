@@ -332,6 +332,8 @@ def spoil(name, text):
         (spoil("depth.txt", b"noon depth/x.png\n"), "a row does not start with a time in seconds"),
         (spoil("depth.txt", b"1.0\n"), "'1.0' has 1 columns, not 2"),
         (spoil("depth.txt", b"nan depth/x.png\n"), "a row does not start with a time in seconds"),
+        (spoil("depth.txt", b"1e999999999 depth/x.png\n"), "a row does not start with a time in seconds"),
+        (spoil("groundtruth.txt", b"1e18 0 0 0 0 0 0 1\n"), "a row does not start with a time in seconds"),
         (spoil("depth.txt", b"\xff\xfe"), "depth.txt: cannot be read"),
         (spoil("groundtruth.txt", b"1.0 0 0 0 0 0 0 0\n"), "is not a pose"),
         (spoil("groundtruth.txt", b"1.0 0 0 0 0 0 0 one\n"), "is not a pose"),

@@ -293,6 +293,9 @@ class TestCommandLine:
     def test_a_session_keeps_its_arm(self, map_file, views, tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(map_file.parent)
         table = tmp_path / "table"
+        (tmp_path / "loop").symlink_to("loop")
+        assert run_command("session", "new", table, "--robot", f"arm:{tmp_path / 'loop'}") == 1
+        assert "loop: cannot be read" in capsys.readouterr().err
         assert run_command("session", "new", table, "--robot", f"arm:{map_file.name}", "--quiet") == 0
         monkeypatch.chdir(tmp_path)
         with Session.open(table) as session:

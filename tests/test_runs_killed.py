@@ -67,16 +67,12 @@ def check_next(folder, words):
     assert seed_of(folder) == 3
 
 
-@pytest.mark.parametrize(("steps", "found"), [(0, 1), (1, None), (2, 2)])
+@pytest.mark.parametrize(("steps", "found"), [(0, 1), (1, 1), (2, 2)])
 def test_killed_while_it_gives_way(tmp_path, words, steps, found):
     folder = tmp_path / "runs/run"
     done = subprocess.run([sys.executable, "-c", DIES, str(steps), *words, "--seed", "2"], check=False)
     assert done.returncode == -9
-    assert folder.exists() == (found is not None)
-    if found is None:
-        assert run_command(*words, "--set=sensor.width=0") != 0
-    else:
-        assert seed_of(folder) == found
+    assert seed_of(folder) == found
     check_next(folder, words)
 
 

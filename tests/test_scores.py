@@ -176,7 +176,7 @@ def test_without_a_true_table_the_extracted_one_is_wrong():
 
 def write_run(folder, *views):
     """A run of graphs with label images and names."""
-    with RunWriter(folder, Config(), {}) as run:
+    with RunWriter(folder, Config(), {"source": "two", "seed": 0, "options": {}}) as run:
         for graph, labels, name in views:
             run.add(step_of(graph, labels, name))
     return folder

@@ -77,6 +77,7 @@ def test_an_unknown_name_lists_the_valid_ones(flag, listed):
         ("voxels.extent=[16, 16, 10]", "take 5.12 GB, more than voxels.max_voxels = 64000000"),
         ("fusion.keep_share=1.01", "less than or equal to 1"),
         ("robot.pitch=[20, -60]", "in ascending order"),
+        (f"fit.steps={'[' * 5000}", "a valid integer"),
     ],
 )
 def test_a_value_of_the_wrong_type_or_range_says_what_is_wanted(flag, wanted):
@@ -121,6 +122,8 @@ def test_a_flag_without_stage_name_or_value_is_refused(flag):
         (b"[fit]\nstep = 3\n", "fit.step"),
         (b"fit = 3\n", "is a table, not a setting"),
         (b"[fit\n", "invalid TOML"),
+        (b"[fit]\nsteps = " + b"[" * 5000, "invalid TOML"),
+        (b"[fit" + b".steps" * 5000 + b"]\n", "is nested too deeply"),
         (None, "cannot be read"),
     ],
 )

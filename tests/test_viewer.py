@@ -9,6 +9,8 @@ import urllib.error
 import urllib.request
 from dataclasses import replace
 from functools import partial
+from socket import create_connection
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -382,6 +384,11 @@ def test_only_the_viewers_own_page_with_its_token_comes_in(page):
     for socket in (False, True):
         assert all(came(page.url, socket=socket, **headers) == 403 for headers in strangers)
         assert {came(address, socket=socket) for address in (root, f"{root}/x", f"{root}/%C3%A9")} == {403}
+    there = urlsplit(root)
+    for path, header in (("x", "Host: localhost"), ("/é", "Host: localhost"), ("/", "Origin: null")):
+        with create_connection((there.hostname, there.port)) as connection:
+            connection.sendall(f"GET {path} HTTP/1.1\r\n{header}\r\n\r\n".encode())
+            assert connection.recv(100).startswith(b"HTTP/1.1 403 ")
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from caryatid.graph import Change, Grasp, SupportGraph, TakeStep
 from caryatid.io import images
 from caryatid.io.graph_json import graph_text, read_graph
 from caryatid.io.json_files import json_text, parse_json, read_json
-from caryatid.io.staging import StagedFolder, read_errors
+from caryatid.io.staging import StagedFolder, read_errors, recover
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
@@ -204,13 +204,34 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
+class _Score:
+    """An entry of `scores`."""
+
+    f1: float
+    precision: float
+    recall: float
+    matches: dict[str, str] = field(default_factory=dict)
+    wrong: list[tuple[str, str]] = field(default_factory=list)
+    missing: list[tuple[str, str]] = field(default_factory=list)
+    unfound: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
 class _RunFile:
     """run.json; version 1, of caryatid 0.1.0, has no step.npz."""
 
     format: Literal["caryatid/run"]
     version: Literal[1, 2]
     views: PositiveInt
+    source: str
+    seed: int
+    options: dict[str, Any]
     settings: dict[str, Any] = field(default_factory=dict)
+    scores: list[_Score] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    versions: dict[str, str] = field(default_factory=dict)
+    conditions: str | None = None
+    date: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,12 +246,14 @@ def read_run(folder: str | Path) -> Run:
         InputError: It is not a run folder, or a file in it is missing or broken.
     """
     folder, remedy = Path(folder), "give a run folder, as written by explore, extract or clear"
-    if not folder.is_dir():
+    if not _exists(folder):
         raise InputError(folder, "no such folder", remedy)
     path = folder / "run.json"
     record = read_json(path, remedy)
-    count = parse_json(_RunFile, record, path, AGAIN).views
-    views = tuple(_read_view(folder / _view_folder(index)) for index in range(count))
+    file = parse_json(_RunFile, record, path, AGAIN)
+    if file.scores and len(file.scores) != file.views:
+        raise InputError(path, f"the number of scores, {len(file.scores)}, is not that of views", AGAIN)
+    views = tuple(_read_view(folder / _view_folder(index)) for index in range(file.views))
     return Run(folder, record, read_graph(folder / "graph.json"), views)
 
 
@@ -260,9 +283,16 @@ def read_config(run: Run) -> Config:
 def is_run(folder: Path) -> bool:
     """Whether a folder was written by `RunWriter`, whatever its version."""
     try:
-        return read_json(folder / "run.json").get("format") == FORMAT
+        return _exists(folder) and read_json(folder / "run.json").get("format") == FORMAT
     except InputError:
         return False
+
+
+def _exists(folder: Path) -> bool:
+    """Whether a folder exists; if a kill while it was being replaced hid it, it is restored."""
+    if not folder.is_dir():
+        recover(folder)
+    return folder.is_dir()
 
 
 def _own_files(folder: Path) -> set[str]:

@@ -21,6 +21,7 @@ from caryatid.benchmark.statistics import BINS, CONFIDENCE, RESAMPLES, summarise
 from caryatid.benchmark.store import ResultStore, describe_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES
 from caryatid.errors import InputError
+from caryatid.io.staging import write_file
 from caryatid.viz.tables import count_of
 
 if TYPE_CHECKING:
@@ -198,7 +199,7 @@ def write_results(results: Sequence[SuiteResult], about: dict[str, str], path: P
         for each in results
     ]
     text = json.dumps({"about": about, "suites": suites}, ensure_ascii=False)
-    path.write_bytes(gzip.compress(text.encode(), mtime=0))
+    write_file(path, gzip.compress(text.encode(), mtime=0))
 
 
 def read_results(path: Path) -> tuple[list[SuiteResult], dict[str, str]]:
@@ -230,7 +231,7 @@ def _write_page(results: Sequence[SuiteResult], about: dict[str, str], folder: P
     reader = MarkdownIt("commonmark", {"html": False}).enable("table")
     reader.validateLink = lambda url: url.startswith("data:image/svg+xml;")  # type: ignore[method-assign]
     text = reader.render(_markdown(results, about, command, keep))
-    (folder / "index.html").write_text(PAGE.format(body=text), encoding="utf-8")
+    write_file(folder / "index.html", PAGE.format(body=text).encode())
 
 
 def write_document(results: Sequence[SuiteResult], about: dict[str, str], path: Path, command: str) -> None:
@@ -242,7 +243,7 @@ def write_document(results: Sequence[SuiteResult], about: dict[str, str], path: 
         figure.save(folder / f"{suite}-{figure.name}.svg")
         return f"{folder.name}/{suite}-{figure.name}.svg"
 
-    path.write_text(_markdown(results, about, command, keep), encoding="utf-8")
+    write_file(path, _markdown(results, about, command, keep).encode())
 
 
 def _markdown(

@@ -37,7 +37,7 @@ def read_settings(file: Path | None, flags: Sequence[str], base: Config | None =
             document = tomllib.loads(file.read_text(encoding="utf-8"))
         except OSError as error:
             raise InputError(file, f"cannot be read ({error.strerror})", "give a TOML file") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise InputError(file, f"invalid TOML: {error}", "correct it, or see `caryatid config`") from None
         config = changed_settings(config, document, str(file))
     for flag in flags:
@@ -64,6 +64,8 @@ def changed_settings(base: Config, document: Mapping[str, Any], source: str) -> 
         return _ADAPTER.validate_json(json.dumps(settings, default=str), strict=True)
     except ValidationError as error:
         raise _refusal(error, settings, source) from None
+    except RecursionError:
+        raise InputError(source, "is nested too deeply", "correct it, or see `caryatid config`") from None
 
 
 def write_settings(config: Config) -> str:
@@ -114,7 +116,7 @@ def _parse_flag(flag: str) -> dict[str, Any]:
     for text in (value, f'"{value}"'):
         try:
             return tomllib.loads(f"{name} = {text}")
-        except tomllib.TOMLDecodeError:
+        except (tomllib.TOMLDecodeError, RecursionError):
             continue
     raise InputError("--set", f"'{value}' is not a TOML value", "write the value as in TOML")
 

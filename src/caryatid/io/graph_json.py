@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from math import inf, isfinite
@@ -151,19 +152,20 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
     given = parse_json(_Graph, document, name, "give a graph.json of version 1")
     ids = [o.id for o in given.objects]
     pairs = [(s.supporter, s.supported) for s in given.supports]
-    for twice in {i for i in ids if ids.count(i) > 1}:
+    for twice in (i for i, count in Counter(ids).items() if count > 1):
         raise InputError(name, f"two objects have the id '{twice}'", "give each object a unique id")
     if sum(o.role == "support_surface" for o in given.objects) > 1:
         raise InputError(name, "has two support surfaces", "keep one; the others are objects")
-    for one, other in pairs:
+    for (one, other), count in Counter(pairs).items():
         if one == other:
             raise InputError(name, f"'{one}' supports itself", "remove the edge")
-        if pairs.count((one, other)) > 1:
+        if count > 1:
             raise InputError(name, f"duplicate edge {one} → {other}", "keep one of them")
-    for known in [*(i for pair in pairs for i in pair), *given.stability]:
-        if known not in ids:
+    known = {*ids}
+    for named in (*(i for pair in pairs for i in pair), *given.stability):
+        if named not in known:
             there = f"known objects: {', '.join(ids) or 'none'}"
-            raise InputError(name, f"unknown object '{known}'", there)
+            raise InputError(name, f"unknown object '{named}'", there)
     return SupportGraph(
         tuple(o.decoded(name) for o in given.objects),
         tuple(Support(*vars(s).values()) for s in given.supports),

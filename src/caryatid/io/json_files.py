@@ -21,6 +21,8 @@ T = TypeVar("T")
 
 LARGEST: Final = 2.0**63
 """Largest number in a file, in any unit: its square is finite, and it fits in 64 bits."""
+LARGEST_FILE: Final = 100_000_000
+"""Maximum size of a file [bytes]; reading it takes ten times as much memory."""
 DECIMALS: Final = 9
 """Decimals of floats in files: a nanometre, far below the sensor's noise, far above rounding errors."""
 
@@ -103,9 +105,13 @@ def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any
     """Read a file that holds one JSON object; `remedy` tells the user how to mend it.
 
     Raises:
-        InputError: The file is missing, unreadable, not JSON, holds NaN or infinity, or is not an object.
+        InputError: The file is missing, unreadable, too large, not JSON or not an object, or holds NaN or
+            infinity.
     """
     with read_errors(path, remedy):
+        if (size := path.stat().st_size) > LARGEST_FILE:
+            reason = f"{size / 1e6:,.0f} MB is too large, at most {LARGEST_FILE / 1e6:.0f} MB are read"
+            raise InputError(path, reason, "give a smaller file")
         content = path.read_bytes()
     try:
         document = from_json(content, allow_inf_nan=False)

@@ -121,8 +121,8 @@ def _parse_pcd(content: bytes) -> tuple[Columns, Array]:
     header = MetaData.parse_header(lines)
     if not len(header.fields) == len(header.size) == len(header.type) == len(header.count):
         raise ValueError("FIELDS, SIZE, TYPE and COUNT do not agree")
-    if max(header.count) > 1000:  # the library makes a field of each
-        raise ValueError(f"COUNT {max(header.count)} exceeds 1000")
+    if sum(header.count) > 1000:  # the library makes a field of each
+        raise ValueError(f"the sum of COUNT, {sum(header.count)}, exceeds 1000")
     dtype = header.build_dtype()
     if header.width * header.height != header.points or header.points == 0:
         raise ValueError(f"WIDTH {header.width} × HEIGHT {header.height}, POINTS {header.points}")

@@ -51,7 +51,7 @@ class StagedFolder:
     ) -> None:
         self.folder = Path(folder)
         self.published = goes_on
-        self._place = self.folder.resolve()
+        self._place = Path(os.path.realpath(self.folder))  # unlike `resolve`, takes a link to itself
         self._replaces, self._durable = replaces, durable
         self._partial = _partial(self._place)
         self._old = self._partial.with_name(f"{self._partial.name}{REPLACED}")
@@ -148,6 +148,7 @@ def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
     """
     if path.is_dir():
         raise InputError(path, "is a directory", "give a file")
+    recover(path)
     partial = _partial(path)
     with write_errors(path):
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -28,6 +28,8 @@ PUBLISHED: Final[Mapping[str, tuple[float, float, float, float]]] = {
 }
 """Published fx, fy, cx, cy [px] of the data set's three cameras of 640×480 pixels."""
 _WORLD, _CAMERA = "world", "camera"
+_LATEST: Final = 2**32
+"""Upper limit of times [s], in 2106: in nanoseconds, they and their differences fit in 64 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,11 +112,15 @@ def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
     timed = []
     for words in filter(None, (line.partition("#")[0].split() for line in lines)):
         try:
-            timed.append((int(Decimal(words[0]) * SECOND), words[1:]))
-        except (InvalidOperation, ValueError, OverflowError):
-            raise _broken(path, "a row does not start with a time in seconds") from None
+            time = Decimal(words[0])
+            valid = abs(time) < _LATEST
+        except ArithmeticError:
+            valid = False
+        if not valid:
+            raise _broken(path, "a row does not start with a time in seconds")
         if len(words) != columns:
             raise _broken(path, f"'{' '.join(words)}' has {len(words)} columns, not {columns}")
+        timed.append((int(time * SECOND), words[1:]))
     return timed
 
 

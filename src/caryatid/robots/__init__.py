@@ -97,7 +97,7 @@ def find_robot(name: str) -> RobotMaker:
 
 def located(name: str) -> str:
     """Return a robot's name with the file in it as an absolute path, for use from other folders."""
-    return f"{ARM}{Path(name.removeprefix(ARM)).resolve()}" if name.startswith(ARM) else name
+    return f"{ARM}{Path(name.removeprefix(ARM)).absolute()}" if name.startswith(ARM) else name
 
 
 def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:

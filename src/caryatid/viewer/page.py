@@ -447,15 +447,16 @@ def _serve(title: str, host: str, port: int, token: str) -> Any:
 
 def _is_allowed(request: Any, host: str, token: str) -> bool:
     """Whether a request has the token, names this machine, and comes from the viewer's own page."""
-    named, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
     try:
-        name = urlsplit(f"//{named[0]}").hostname if len(named) == 1 else None
+        (named,) = request.headers.get_all("Host")
+        name = urlsplit(f"//{named}").hostname
+        _, first, *_ = request.path.partition("?")[0].encode().split(b"/")
     except ValueError:
         return False
     known = name in {"127.0.0.1", "localhost", "::1", host} or (name and host in ("0.0.0.0", "::", ""))
-    ours = all(origin in (f"http://{named[0]}", f"https://{named[0]}") for origin in origins)
-    first = request.path.partition("?")[0].split("/")[1]
-    return bool(known and ours and secrets.compare_digest(first.encode(), token.encode()))
+    origins = request.headers.get_all("Origin")
+    ours = all(origin in (f"http://{named}", f"https://{named}") for origin in origins)
+    return bool(known and ours and secrets.compare_digest(first, token.encode()))
 
 
 @contextlib.contextmanager
