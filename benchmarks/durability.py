@@ -486,7 +486,7 @@ def put_load(
 
     with hostile_clients(robot.address, hostile) as answers, ThreadPoolExecutor(clients) as threads:
         list(threads.map(work, range(clients)))
-    found = {name: (robot.views(name), robot.graph(name)) for name in names}
+    found = {name: (robot.session(name)["views"], robot.graph(name)) for name in names}
     assert service.pid is not None
     os.kill(service.pid, signal.SIGTERM)
     service.join()

@@ -60,7 +60,7 @@ class RobotClient:
         images = {"depth": depth, "rgb": rgb, "labels": labels}
         view: dict[str, Any] = {k: base64.b64encode(v).decode() for k, v in images.items() if v is not None}
         view["camera"] = {"K": K, "T_world_camera": T_world_camera, "depth_scale": depth_scale}
-        view["number"] = self.views(name) if number is None else number
+        view["number"] = self.session(name)["views"] if number is None else number
         return self._ask("POST", f"/sessions/{name}/views", view)
 
     def next(self, name: str, candidates: list[Matrix] | None = None) -> dict[str, Any]:
@@ -75,18 +75,15 @@ class RobotClient:
 
     def take(self, name: str, object_id: str, T: Matrix | None = None) -> dict[str, Any]:
         """Report that an object was removed, or moved by a rigid transform T in the world frame."""
-        report = {"object": object_id, "T": T, "number": self._known(name)["reports"]}
+        report = {"object": object_id, "T": T, "number": self.session(name)["reports"]}
         return self._ask("POST", f"/sessions/{name}/reports", report)
 
     def undo(self, name: str) -> dict[str, Any]:
         """Take back the last view, or the report after it."""
         return self._ask("DELETE", f"/sessions/{name}/views/last")
 
-    def views(self, name: str) -> int:
-        """Number of views of a session."""
-        return int(self._known(name)["views"])
-
-    def _known(self, name: str) -> dict[str, Any]:
+    def session(self, name: str) -> dict[str, Any]:
+        """Number of views and reports of a session, and its options."""
         return self._ask("GET", f"/sessions/{name}")
 
     def _ask(self, method: str, path: str, body: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -103,8 +100,7 @@ class RobotClient:
                     raise RuntimeError(f"{method} {path}: {error.code} {error.read().decode()}") from None
             except (OSError, http.client.HTTPException):
                 # No retry: a second undo removes another view. Numbers make views and reports safe to repeat.
-                once = method == "DELETE" or path == "/sessions"
-                if once or time.monotonic() - begun > self.patience:
+                if method == "DELETE" or path == "/sessions" or time.monotonic() - begun > self.patience:
                     raise
             time.sleep(0.2)
 

@@ -374,13 +374,12 @@ class Scene(Pictured):
         observation = self._observed(source)
         if observation.view is not None and isinstance(source, View):
             self._say_thinned(source, observation.view)
-            if not given:  # masks show what has no depth
+            check_range(source, self.config)
+            if given:
+                check_masks(source, observation.cloud.viewpoint_world, observation.surface, self.config)
+            else:  # masks show what has no depth
                 self._check_holes(observation.view, observation.surface)
         self._check_found(observation, source.name, masks=given)
-        if isinstance(source, View):
-            check_range(source, self.config)
-        if given:
-            check_masks(source, observation, self.config)
         if not self.views:
             check_size(source.name, observation.surface, self.config.surface)
         watch.lap("segment")

@@ -10,7 +10,6 @@ from caryatid.config import Config, SurfaceConfig
 from caryatid.errors import WrongViewError
 from caryatid.geometry import polygons
 from caryatid.geometry.transforms import Array
-from caryatid.segmentation.observation import Observation
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
 from caryatid.sensing.voxel_map import FREE, VoxelMap
@@ -60,22 +59,32 @@ def check_centre(view: View) -> None:
 
 def check_range(view: View, config: Config) -> None:
     """Warn of a surface as large as an object that is too near for the camera's range."""
-    near = view.depth[view.valid & (view.depth < config.cloud.min_depth)]
+    near = view.depth[(view.depth > 0.0) & (view.depth < config.cloud.min_depth)]
     if ((near / view.K[0, 0]) ** 2).sum() >= config.segmentation.min_area:
         text = "%s: %d readings nearer than cloud.min_depth = %g m are ignored"
         log.warning(text, view.name, len(near), config.cloud.min_depth)
 
 
-def check_masks(source: View | Cloud, observation: Observation, config: Config) -> None:
-    """Warn of masks of a view that are as large as an object and have too few points for a shape."""
-    view = observation.view
-    if view is None or source.labels is None or not isinstance(source, View):
-        return
-    pixels = np.bincount(source.labels.ravel())
-    points = np.bincount(observation.labels, minlength=len(pixels))[: len(pixels)]
-    distance = float(np.linalg.norm(view.pose[:3, 3] - observation.surface.point_world))
-    large = pixels * (distance / source.K[0, 0]) ** 2 >= config.segmentation.min_area
-    lost = np.flatnonzero(large & (points < config.fit.min_points))
+def check_masks(view: View, eye_world: Array | None, surface: SupportSurface, config: Config) -> None:
+    """Warn of masks as large as an object with too few readings for a shape, as of transparent objects.
+
+    Args:
+        view: The view, with its masks.
+        eye_world: Position of its camera (3,) [m].
+        surface: The support surface.
+        config: All settings.
+    """
+    assert view.labels is not None
+    assert eye_world is not None
+    masks, middle = view.labels, view.labels[1:-1, 1:-1]
+    # At the borders of masks, sensors often have no reading.
+    inner = (middle == masks[:-2, 1:-1]) & (middle == masks[2:, 1:-1])
+    inner &= (middle == masks[1:-1, :-2]) & (middle == masks[1:-1, 2:])
+    pixels = np.bincount(middle[inner])
+    readings = np.bincount(middle[inner], view.depth[1:-1, 1:-1][inner] > 0.0)
+    distance = np.linalg.norm(eye_world - surface.point_world)
+    large = pixels * (distance / view.K[0, 0]) ** 2 >= config.segmentation.min_area
+    lost = np.flatnonzero(large & (readings < config.fit.min_points))
     if names := ", ".join(str(label) for label in lost if label != 0):
         log.warning("%s: too few depth readings in mask %s; its object is missed", view.name, names)
 
