@@ -135,6 +135,8 @@ def test_what_the_robot_does_is_known_without_a_look(scene):
     put = scene.added(box((-0.2, -0.2, 0.75 + 0.03), (0.06, 0.06, 0.06)))
     assert ("o0", put) in edges(scene.graph)
     assert kinds(scene) == [("removed", "o4"), ("moved", "o5"), ("added", put)]
+    assert scene.added(before["o4"].shape, label=4) == "o4"
+    assert ("o3", "o4") in edges(scene.graph)
 
 
 def test_changes_that_the_robot_reported_hold_when_it_looks_again(scene, state):

@@ -375,7 +375,7 @@ class TestInfer:
         beside = explain(graph, "o4", "o5", CONFIG)
         assert "o5 rests without it (gap 1.0 mm, normal 90° from the vertical). Probability 0.00." in beside
         assert explain(infer(objects, PAPER), "o2", "o1", PAPER).startswith(
-            "o2 does not support o1: it is not"
+            "o2 does not support o1: o2 is not"
         )
         with pytest.raises(InputError, match="not an object of the graph"):
             explain(graph, "o1", "o9", CONFIG)

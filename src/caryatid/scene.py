@@ -235,8 +235,8 @@ class Scene(Pictured):
         if not 0.0 < shape.extents.min() <= shape.extents.max() <= self.config.cloud.max_depth:
             reason = f"has extents of {shape.extents.round(3).tolist()} m"
             raise InputError("shape", reason, "give lengths above 0, in metres")
-        label = max(self._taken()) + 1 if label is None else label
-        if label in self._taken() or not 0 < label < SUPPORT_LABEL:
+        label = self._free_label() if label is None else label
+        if label in self._labels() or not 0 < label < SUPPORT_LABEL:
             remedy = f"give a number from 1 to {SUPPORT_LABEL - 1} that no other object has"
             raise InputError("label", f"{label} is not free", remedy)
         self._models.put(shape, label, self.views - 1)
@@ -257,10 +257,14 @@ class Scene(Pictured):
         known = ", ".join(o.id for o in self.graph.objects if o.role == "object")
         raise InputError(object_id, "is not an object of the graph", f"known objects: {known or 'none'}")
 
-    def _taken(self) -> set[int]:
-        """Labels that objects have or had, and 0."""
+    def _labels(self) -> set[int]:
+        """Labels of the objects, in the models and in the graph."""
         own = {o.label for o in self.graph.objects if o.role == "object"}
-        return {0, self._models.points.labels_used, *self._models.points.objects, *own}
+        return {*self._models.points.objects, *own}
+
+    def _free_label(self) -> int:
+        """A label that no object has or had."""
+        return max(self._models.points.labels_used, *self._labels(), 0) + 1
 
     def _forget(self, o: SceneObject, T: Array | None = None) -> None:
         """Forget an object, or move its points and shape by T; its supports are dropped."""
@@ -276,7 +280,7 @@ class Scene(Pictured):
         else:
             self._models.forget(set() if label is None else {label})
             if T is not None:  # With `sg`, only objects of the newest view have a fit.
-                label = max(self._taken()) + 1
+                label = self._free_label()
                 self._models.put(o.shape.moved(T), label, self.views - 1)
                 self._ids = self._ids | {label: o.id}
         self._graphs = tuple(without(graph, {o.id}) for graph in self._graphs)

@@ -158,8 +158,8 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
         raise InputError(path, f"not an MJCF file ({reason})", "correct the XML") from None
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
     scene = scene_from_spec(spec, name or path.stem, str(path), config)
-    floor = table_centre(scene)[2]
-    if fallen := [body for label, body in scene.object_bodies.items() if bounds(scene, label)[1][2] < floor]:
+    top = table_centre(scene)[2]
+    if fallen := [body for label, body in scene.object_bodies.items() if bounds(scene, label)[1][2] < top]:
         log.warning("%s: %s fell off the table before the first view", path, ", ".join(fallen))
     if not scene.at_rest:
         log.warning("%s: the scene still moves; its ground truth may change between views", path)
