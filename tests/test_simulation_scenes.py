@@ -64,7 +64,7 @@ def write(path: Path, text: str) -> Path:
 # MJCF
 
 
-def test_objects_that_fall_off_or_never_rest_are_warned_of(tmp_path, caplog):
+def test_objects_that_fall_off_are_warned_of(tmp_path, caplog):
     beside = '<body name="apple" pos="3 0 0.1"><freejoint/><geom type="sphere" size="0.03"/></body>'
     load_scene(write(tmp_path / "still.xml", mjcf(TABLE + CUBE)))
     assert not caplog.messages
