@@ -25,6 +25,7 @@ from caryatid.manipulation.clearing import clear
 from caryatid.manipulation.dismantling import SimulatedHands, bodies_of
 from caryatid.manipulation.grasps import Blocked, find_grasp, gripper_boxes
 from caryatid.manipulation.order import plan_order
+from caryatid.robots.reachability import ReachabilityMap, write_reachability
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.simulation.lifting import ASIDE, Lifting
 from caryatid.simulation.truth import ground_truth
@@ -361,6 +362,23 @@ class TestCommands:
         assert re.search(r"│ 1 │ o2 +│ – +│ 0.83 ", table)
         assert run_command("order", kept_run, *QUICK, "--risk", "1.5") == 1
         assert "rehearsal.risk" in capsys.readouterr().err
+
+    def test_grasps_must_lie_within_the_arms_reach(self, kept_run, tmp_path, capsys):
+        everything = np.full((8, 8, 8, 1), 255, dtype=np.uint8)
+        for name, x in (("around.npz", -4.0), ("beside.npz", 4.0)):
+            write_reachability(
+                tmp_path / name, ReachabilityMap(everything, np.array([x, -4.0, -4.0]), 1.0, 0.0)
+            )
+        jaw, orders = ("--json", "--gripper", "parallel"), []
+        for given in ((), ("--reach", tmp_path / "around.npz"), ("--reach", tmp_path / "beside.npz")):
+            assert run_command("order", kept_run, *jaw, *given, *QUICK) == 0
+            orders.append(json.loads(capsys.readouterr().out))
+        assert orders[0] == orders[1] != orders[2]
+        assert orders[2]["steps"] == []
+        assert "o2: every grasp is out of reach" in orders[2]["refusal"]
+        for given, said in ((("--gripper", "none"), "add --gripper"), (jaw[1:], "missing.npz")):
+            assert run_command("order", kept_run, *given, "--reach", tmp_path / "missing.npz", *QUICK) == 1
+            assert said in capsys.readouterr().err
 
     def test_orders_that_cannot_be_are_errors(self, kept_run, tmp_path, capsys):
         assert run_command("order", kept_run, "--goal", "o9", *QUICK) == 1

@@ -8,18 +8,26 @@ from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from caryatid.config.choices import FusionMethod, MaskIdentity, NoiseModel, Preset, SegmentationMethod
+from caryatid.config.choices import (
+    FusionMethod,
+    GripperKind,
+    MaskIdentity,
+    NoiseModel,
+    Preset,
+    SegmentationMethod,
+)
 from caryatid.errors import InputError
 
 if TYPE_CHECKING:
     from caryatid.cli.output import Output
     from caryatid.config import Config
     from caryatid.io.mask_sources import MaskSource
+    from caryatid.robots.reachability import ReachabilityMap
 
 
 def shown(metavar: str | None = None, default: object = "") -> object:
@@ -248,3 +256,38 @@ class ExploringCommand(PlanningCommand):
     def config(self) -> Config:
         """All settings."""
         return self.settings.read({"active.max_views": self.views}, takes_views=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiftingCommand:
+    """A command that decides which objects to lift."""
+
+    goal: Annotated[str | None, shown("ID")] = None
+    """Object to reach; remove no more than necessary."""
+    hands: Literal[1, 2] = 2
+    """Number of hands; with 2, one may hold an object while the other lifts one."""
+    gripper: Annotated[GripperKind | None, one_of(GripperKind), default_of("gripper.kind")] = None
+    """Offer only lifts with a grasp on a free path; dimensions are the settings `gripper.*`."""
+    reach: Annotated[Path | None, shown("FILE.npz")] = None
+    """Offer only grasps within an arm's reach: a reachability map of the gripper, in the world frame."""
+    risk: Annotated[float | None, default_of("rehearsal.risk", "P")] = None
+    """Maximum probability that a lift moves another object."""
+
+    def lift_settings(self) -> dict[str, object]:
+        """Settings that have an option here, with its value, or None if omitted."""
+        return {"rehearsal.risk": self.risk, "gripper.kind": self.gripper}
+
+    def reachable(self, config: Config) -> ReachabilityMap | None:
+        """Which gripper poses the arm reaches; None = all.
+
+        Raises:
+            InputError: The file is broken, or there is no gripper.
+        """
+        from caryatid.robots.reachability import read_reachability
+
+        if self.reach is None:
+            return None
+        if config.gripper.kind == "none":
+            reason = "is of no use without a gripper"
+            raise InputError(f"--reach {self.reach}", reason, "add --gripper parallel or --gripper suction")
+        return read_reachability(self.reach)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 import tyro
 
 from caryatid.cli import options
-from caryatid.config.choices import ExportFormat, GripperKind
+from caryatid.config.choices import ExportFormat
 
 Topic = Annotated[str | None, options.shown("TOPIC")]
 
@@ -104,7 +104,7 @@ class Evaluate(options.Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OrderCommand(options.ComputingCommand):
+class OrderCommand(options.LiftingCommand, options.ComputingCommand):
     """Find a safe order in which to remove all objects, or to reach one.
 
     Rehearse each lift in physics, on the extracted shapes and on samples of their uncertainty, to estimate
@@ -120,16 +120,6 @@ class OrderCommand(options.ComputingCommand):
     settings: options.Modelling = options.Modelling()
     run: options.RunPath
     """Run folder."""
-    goal: Annotated[str | None, options.shown("ID")] = None
-    """Object to reach; remove no more than necessary."""
-    hands: Literal[1, 2] = 2
-    """Number of hands; with 2, one may hold an object while the other lifts one."""
-    gripper: Annotated[
-        GripperKind | None, options.one_of(GripperKind), options.default_of("gripper.kind")
-    ] = None
-    """Offer only lifts with a grasp on a free path; dimensions are the settings `gripper.*`."""
-    risk: Annotated[float | None, options.default_of("rehearsal.risk", "P")] = None
-    """Maximum probability that a lift moves another object."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
@@ -138,10 +128,11 @@ class OrderCommand(options.ComputingCommand):
         from caryatid.steps import read_run
         from caryatid.viz.tables import order_table
 
-        config = self.settings.read({"rehearsal.risk": self.risk, "gripper.kind": self.gripper})
-        seed, graph = self.settings.seed, read_run(self.run).graph
+        config = self.settings.read(self.lift_settings())
+        graph, reachable = read_run(self.run).graph, self.reachable(config)
+        known: dict[str, Any] = {"goal": self.goal, "hands": self.hands, "seed": self.settings.seed}
         with self.output.working("rehearsing"):
-            order = plan_order(graph, config, goal=self.goal, hands=self.hands, seed=seed, threads=cores())
+            order = plan_order(graph, config, threads=cores(), reachable=reachable, **known)
         outcome = "a safe order" if order.safe else "no safe order"
         goal = f" to reach {self.goal}" if self.goal else ""
         steps = order_table(order)

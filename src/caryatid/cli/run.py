@@ -10,12 +10,11 @@ from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from caryatid.cli import options
-from caryatid.config.choices import GripperKind
 from caryatid.errors import InputError
 
 if TYPE_CHECKING:
@@ -242,7 +241,7 @@ class Extract(RunCommand, options.LookingCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clear(options.ExploringCommand):
+class Clear(options.LiftingCommand, options.ExploringCommand):
     """Clear a simulated table: look until the next lift is safe, remove the object, look again.
 
     Objects are lifted straight up, one by one. A lift disturbs another object if it moves that object by
@@ -258,16 +257,6 @@ class Clear(options.ExploringCommand):
     """Built-in or MJCF scene."""
     out: options.OutPath = Path("run")
     """Run folder to write, view by view; replaces an existing run, or continues it if interrupted."""
-    goal: Annotated[str | None, options.shown("ID")] = None
-    """Object to reach; remove no more than necessary."""
-    hands: Literal[1, 2] = 2
-    """Number of hands; with 2, one may hold an object while the other lifts one."""
-    gripper: Annotated[
-        GripperKind | None, options.one_of(GripperKind), options.default_of("gripper.kind")
-    ] = None
-    """Offer only lifts with a grasp on a free path; dimensions are the settings `gripper.*`."""
-    risk: Annotated[float | None, options.default_of("rehearsal.risk", "P")] = None
-    """Maximum probability that a lift moves another object."""
     views: Annotated[options.OptionalCount, options.default_of("active.max_views")] = None
     """Maximum number of views before each lift."""
     no_report: options.Flag = False
@@ -275,8 +264,7 @@ class Clear(options.ExploringCommand):
 
     def config(self) -> Config:
         """All settings."""
-        given = {"active.max_views": self.views, "rehearsal.risk": self.risk, "gripper.kind": self.gripper}
-        return self.settings.read(given, takes_views=True)
+        return self.settings.read({"active.max_views": self.views} | self.lift_settings(), takes_views=True)
 
     def __call__(self) -> None:
         import numpy as np
@@ -294,6 +282,7 @@ class Clear(options.ExploringCommand):
         from caryatid.viz.tables import count_of
 
         config, seed, output = self.config(), self.settings.seed, self.output
+        reachable = self.reachable(config)
         with output.working("opening"):
             masks = self.mask_source(config)
             source = _opening(self, masks)(config)
@@ -332,7 +321,7 @@ class Clear(options.ExploringCommand):
                     writer.files[lift_file(len(writer.steps))] = lift_picture(drawn)
                 return taken.body is not None
 
-            known = {"goal": self.goal, "hands": self.hands, "threads": cores()}
+            known = {"goal": self.goal, "hands": self.hands, "threads": cores(), "reachable": reachable}
             steps = clear(explorer, take, past=() if past is None else read_steps(past), **known)
             writer.more["conditions"] = conditions = _conditions(self)
             last = _record(writer, steps, None, output, f"{source.name} ({conditions})")
@@ -405,8 +394,10 @@ def _conditions(command: RunCommand | Clear) -> str:
 
 def _about(command: RunCommand | Clear) -> dict[str, Any]:
     """Entries of run.json about the command."""
-    names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands")
-    options = {name: getattr(command, name) for name in names if hasattr(command, name)}
+    from caryatid.io.json_files import plain
+
+    names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands", "reach")
+    options = plain({name: getattr(command, name) for name in names if hasattr(command, name)})
     options |= {"preset": command.settings.preset, "masks": command.settings.masks}
     if isinstance(command, Explore | Clear):
         options["planner"] = command.chosen_planner
