@@ -40,6 +40,7 @@ CALM = 0.2
 """Background load: cores that other processes may use before a measurement without a warning [1]."""
 MEASUREMENTS: dict[str, Callable[[Effort], list[Row]]] = {
     "turn": speed.measure_turns,
+    "beside": speed.measure_beside,
     **{f"fit.{kind}": partial(measure_fits, kind) for kind in ("cylinder", "box", "sphere")},
     "decision": speed.measure_decision,
     "map": speed.measure_map,

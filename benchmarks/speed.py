@@ -9,8 +9,9 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from multiprocessing import get_context
@@ -210,6 +211,37 @@ def measure_turns(effort: Effort) -> list[Row]:
         for which, found in (("", later), (".first", first))
     ]
     return rows + _stages(recording, later, effort)
+
+
+def measure_beside(effort: Effort) -> list[Row]:
+    """Measure the step with one busy process per core beside it, against the same step without them."""
+    recording, rows, cores = record(load_scene(HEAP)), [], os.cpu_count() or 1
+    for name in SEGMENTATIONS:
+        took: dict[int, list[float]] = {0: [], cores: []}
+        for _ in range(effort.runs // 3 + 1):
+            for count, turns in took.items():
+                episode = Episode(recording, name)
+                with _busy(count):
+                    looks = zip(recording.poses, recording.views, strict=True)
+                    turns += [episode.look(T_world_camera, view)["turn"] for T_world_camera, view in looks][
+                        1:
+                    ]
+        what = f"view in → next view beside {cores} busy processes, {SEGMENTS[name]}"
+        theirs, peer = took[0], "without them"
+        rows.append(timed_row(f"turn.{name}.beside", what, took[cores], peer=peer, theirs=theirs, target=3.0))
+    return rows
+
+
+@contextmanager
+def _busy(count: int) -> Iterator[None]:
+    """Keep processes busy, and end them."""
+    processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 def _stages(recording: Recording, later: dict[str, list[Laps]], effort: Effort) -> list[Row]:
