@@ -417,6 +417,20 @@ class TestCommands:
                 break
         assert looked_for == {"o4": "o1"}
 
+    def test_a_goal_that_was_not_in_place_is_not_removed(self, scene_file):
+        table = simulate(scene_file)
+        explorer = Explorer(table.camera, table.robot, config=CONFIG)
+        tried = []
+
+        def take(step):
+            tried.append(step.object_id)
+            return False
+
+        *_, last = clear(explorer, take, goal="o2")
+        assert set(tried) == {"o2"}
+        assert len(tried) > 1
+        assert last.stop.endswith("lifts in a row found no object in place")
+
     def test_a_gripper_waits_until_its_path_is_seen(self, scene_file, tmp_path, capsys):
         """Above the table there is nothing to read a depth from, so that space stays unknown."""
         for seen, taken in ((0.95, []), (0.0, ["o2", "o1"])):

@@ -72,6 +72,14 @@ def test_objects_that_fall_off_are_warned_of(tmp_path, caplog):
     assert "fallen.xml: apple fell off the table before the first view" in caplog.text
 
 
+def test_a_scene_that_does_not_come_to_rest_is_warned_of(tmp_path, caplog):
+    high = CUBE.replace("0 0 0.78", "0 0 1.3")
+    for settle_time in (6.0, 0.3):
+        assert not caplog.messages
+        load_scene(write(tmp_path / "high.xml", mjcf(TABLE + high)), PhysicsConfig(settle_time=settle_time))
+    assert "high.xml: the scene still moves" in caplog.text
+
+
 def test_objects_are_the_free_bodies_in_their_order():
     ball = '<body name="ball" pos="0.1 0.2 0.78"><freejoint/><geom type="sphere" size="0.03"/></body>'
     wall = '<geom name="wall" type="box" size="0.03 1 1" pos="0.7 0 1"/>'
