@@ -220,12 +220,10 @@ def measure_beside(effort: Effort) -> list[Row]:
         took: dict[int, list[float]] = {0: [], cores: []}
         for _ in range(effort.runs // 3 + 1):
             for count, turns in took.items():
-                episode = Episode(recording, name)
+                episode, looks = Episode(recording, name), zip(recording.poses, recording.views, strict=True)
                 with _busy(count):
-                    looks = zip(recording.poses, recording.views, strict=True)
-                    turns += [episode.look(T_world_camera, view)["turn"] for T_world_camera, view in looks][
-                        1:
-                    ]
+                    _, *later = [episode.look(T_world_camera, view)["turn"] for T_world_camera, view in looks]
+                turns += later
         what = f"view in → next view beside {cores} busy processes, {SEGMENTS[name]}"
         theirs, peer = took[0], "without them"
         rows.append(timed_row(f"turn.{name}.beside", what, took[cores], peer=peer, theirs=theirs, target=3.0))

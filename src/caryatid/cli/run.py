@@ -394,10 +394,8 @@ def _conditions(command: RunCommand | Clear) -> str:
 
 def _about(command: RunCommand | Clear) -> dict[str, Any]:
     """Entries of run.json about the command."""
-    from caryatid.io.json_files import plain
-
     names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands", "reach")
-    options = plain({name: getattr(command, name) for name in names if hasattr(command, name)})
+    options = {name: getattr(command, name) for name in names if hasattr(command, name)}
     options |= {"preset": command.settings.preset, "masks": command.settings.masks}
     if isinstance(command, Explore | Clear):
         options["planner"] = command.chosen_planner

@@ -1,4 +1,4 @@
-"""Reachability of an arm's camera: a map of positions, directions and rolls, sampled over its joints."""
+"""Reachability of an arm's camera or gripper: a map of positions, directions and rolls, from its joints."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ REMEDY = "sample it again and write it with write_reachability"
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ReachabilityMap:
-    """Cells, directions and rolls in which an arm can hold its camera.
+    """Cells, directions and rolls in which an arm can hold its camera, or its gripper.
 
     Each cell and direction has one byte, whose bits are eighths of a turn about the optical axis. A pose is
     reached if the bit of its roll is set.
