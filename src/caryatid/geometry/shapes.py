@@ -373,7 +373,9 @@ class Sphere(Shape):
 
     def footprint(self) -> Array:
         """Outline (64, 2) [m] of the ball projected to the ground."""
-        return self.cap(transforms.UP, self.radius)
+        angle = 2.0 * np.pi * np.arange(64) / 64
+        ring = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+        return polygons.hull(self.T_world_object[:2, 3] + self.radius * ring)
 
     def cap(self, direction_world: Array, depth: float) -> Array:
         """Rim (64, 2) [m] on the ground of the part within `depth` [m] of its end in a direction (3,).

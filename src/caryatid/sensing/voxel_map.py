@@ -149,11 +149,11 @@ class VoxelMap:
         low, high = ((corner - self.origin_world) / size for corner in arrays.bounds())
         low = np.clip(np.floor(low).astype(np.int64), 0, self.hits.shape)
         high = np.clip(np.ceil(high).astype(np.int64), 0, self.hits.shape)
-        some, index = (low < high).all(axis=1), self.occupied.T
-        lowest = np.concatenate([low[some], index]).min(axis=0, initial=max(self.hits.shape))
-        highest = np.concatenate([high[some], index + 1]).max(axis=0, initial=0)
+        some, index = (low < high).all(axis=1), self.occupied
+        lowest = np.concatenate([low[some].T, index], axis=1).min(axis=1, initial=max(self.hits.shape))
+        highest = np.concatenate([high[some].T, index + 1], axis=1).max(axis=1, initial=0)
         grid = np.zeros(np.maximum(highest - lowest, 0), dtype=np.uint8)
-        grid[tuple(self.occupied - lowest[:, None])] = 1
+        grid[tuple(index - lowest[:, None])] = 1
         origin_world = self.origin_world + size * lowest
         low, high = low - lowest, high - lowest
         for number, shape in enumerate(shapes):

@@ -109,16 +109,17 @@ def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[
     sums = np.zeros((len(samples.names), 8))
     columns = (left, left > 0.0, left[:, None] * samples.points_world, left[:, None] * samples.normals_world)
     np.add.at(sums, samples.subjects, np.column_stack(columns))
-    worth, shown = sums[:, 0], sums[:, 1]
+    worth, shown, most = sums[:, 0], sums[:, 1], sums[:, 0].max(initial=0.0)
+    large = np.flatnonzero((worth > WORTH_SAYING * most) & (shown > 1))
+    middles, outward = sums[large, 2:5] / worth[large, None], sums[large, 5:]
+    nowhere = np.linalg.norm(outward, axis=1, keepdims=True) < 1e-9
+    outward = transforms.unit(np.where(nowhere, middles - state.sphere.centre_world, outward))
     points = []
-    for i in np.flatnonzero((worth > WORTH_SAYING * worth.max(initial=0.0)) & (shown > 1)):
-        name, middle, outward = samples.names[i], sums[i, 2:5] / worth[i], sums[i, 5:]
-        if np.linalg.norm(outward) < 1e-9:
-            outward = middle - state.sphere.centre_world
+    for i, middle, direction in zip(large, middles, outward, strict=True):
+        name, saliency = samples.names[i], float(worth[i] / most)
         subject = () if name == SPACE else (name,)
         why = f"{name} on the table" if name == SPACE else f"part of {name} is unseen"
-        saliency = float(worth[i] / worth.max())
-        points.append(PointOfInterest(middle, transforms.unit(outward), saliency, subject, why))
+        points.append(PointOfInterest(middle, direction, saliency, subject, why))
     return points
 
 
