@@ -63,6 +63,13 @@ def test_the_surface_is_sampled_all_over_as_densely_as_asked(shape):
 
 
 @each
+@pytest.mark.parametrize("spacing", [1e-6, 1e-300])
+def test_a_surface_of_too_many_points_is_refused(shape, spacing):
+    with pytest.raises(InputError, match="is too fine"):
+        shape.surface(spacing)
+
+
+@each
 def test_distances_are_those_to_the_nearest_point_of_the_surface(shape):
     surface, _ = shape.surface(0.002)
     points, _ = around(shape, 400)

@@ -72,6 +72,7 @@ def test_an_unknown_name_lists_the_valid_ones(flag, listed):
         ("robot.pitch=[1, 2, 3]", "at most 2 items"),
         ("robot.pitch=[low, 2]", "a valid array"),
         ("voxels.size=0", "greater than 0"),
+        ("fit.min_extent=2147483648", "less than or equal to 1"),
         ("export.corners=7", "greater than or equal to 8"),
         ("support.touch=1e300", "less than or equal to 1000000000000000000"),
         ("voxels.extent=[16, 16, 10]", "take 5.12 GB, more than voxels.max_voxels = 64000000"),

@@ -210,7 +210,7 @@ class FitConfig:
     """Maximum number of least-squares steps [1]."""
     max_extent: Positive = 0.5
     """Maximum extent of a shape [m]; table-top objects."""
-    min_extent: Positive = 0.008
+    min_extent: Annotated[float, Field(gt=0, le=1)] = 0.008
     """Minimum extent of a shape [m]; below the sensor's resolution."""
     max_radius: Positive = 0.15
     """Maximum radius of a cylinder or sphere [m]."""

@@ -26,6 +26,9 @@ _CYLINDER_EDGES = np.concatenate(
 )
 """Edges (E, 2) between the points of the outline of a box, and of the prism that stands for a cylinder."""
 
+MOST_SAMPLES = 1e7
+"""Maximum number of points on a surface [1]; with their normals they take 0.5 GB."""
+
 KINDS: dict[str, type[Shape]] = {}
 """Every kind of shape by its name, as in graph.json."""
 
@@ -154,7 +157,15 @@ class Shape(Pictured):
         return reach.max(axis=1)
 
     def surface(self, spacing: float) -> tuple[Array, Array]:
-        """Points (N, 3) [m] about `spacing` metres apart all over the surface, and outward normals (N, 3)."""
+        """Points (N, 3) [m] about `spacing` metres apart all over the surface, and outward normals (N, 3).
+
+        Raises:
+            InputError: There would be more than `MOST_SAMPLES` points.
+        """
+        x, y, z = (self.extents / spacing).tolist()
+        if not 2.0 * (x * y + y * z + z * x) <= MOST_SAMPLES:
+            reason = f"is too fine for a {self.kind} of {max(self.extents):.3g} m"
+            raise InputError(f"a spacing of {spacing:.3g} m", reason, "give a larger spacing")
         points, normals = sample_surface(*Primitives.of([self]).row(0), float(spacing))
         return points, normals
 
