@@ -73,6 +73,8 @@ def test_an_unknown_name_lists_the_valid_ones(flag, listed):
         ("robot.pitch=[low, 2]", "a valid array"),
         ("voxels.size=0", "greater than 0"),
         ("fit.min_extent=2147483648", "less than or equal to 1"),
+        ("split.rounds=65535", "less than or equal to 1000"),
+        ("fit.hypotheses=1000000000", "less than or equal to 1000000"),
         ("export.corners=7", "greater than or equal to 8"),
         ("support.touch=1e300", "less than or equal to 1000000000000000000"),
         ("voxels.extent=[16, 16, 10]", "take 5.12 GB, more than voxels.max_voxels = 64000000"),

@@ -42,8 +42,12 @@ Acute = Annotated[float, Field(ge=0, lt=90)]
 """An angle whose cosine is divided by."""
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Azimuth = Annotated[float, Field(ge=-360, le=360)]
-Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
-WholeNumber = Annotated[int, Field(ge=0, le=1_000_000_000)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+WholeNumber = Annotated[int, Field(ge=0, le=1_000_000)]
+Most = Annotated[int, Field(ge=1, le=1_000_000_000)]
+"""A limit on what a machine can hold."""
+Repeats = Annotated[int, Field(ge=0, le=1000)]
+"""Number of times something is tried or repeated; more would take minutes per view."""
 Lengths = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
 """Smallest and largest length."""
 
@@ -204,9 +208,9 @@ class FitConfig:
     """Minimum number of points of an object [1]; a box has nine parameters."""
     threshold: Positive = 0.01
     """MSAC truncation of the distance to the surface [m]; 2σ of registration error."""
-    polish: Count = 3
+    polish: Annotated[Repeats, Field(ge=1)] = 3
     """Number of best hypotheses per shape that least squares refines [1]."""
-    steps: WholeNumber = 25
+    steps: Repeats = 25
     """Maximum number of least-squares steps [1]."""
     max_extent: Positive = 0.5
     """Maximum extent of a shape [m]; table-top objects."""
@@ -230,9 +234,9 @@ class FitConfig:
 class SplitConfig:
     """Model split: one automatic segment may be several objects."""
 
-    cuts: WholeNumber = 5
+    cuts: Repeats = 5
     """Number of cuts tried along each direction [1]; a sixth of the points apart."""
-    rounds: WholeNumber = 3
+    rounds: Repeats = 3
     """Number of times points are assigned to the better shape and both shapes are refitted [1]."""
     min_points: Count = 20
     """Minimum number of downsampled points on each side [1]; 1.5 times what a shape needs."""
@@ -284,7 +288,7 @@ class CompletionConfig:
 class PlausibilityConfig:
     """Correction of shapes that overlap or float."""
 
-    rounds: WholeNumber = 3
+    rounds: Repeats = 3
     """Maximum number of corrections [1]; 0 leaves shapes as fitted."""
     touch: NotNegative = 0.001
     """Maximum gap or overlap of two shapes in contact [m]; round edges, soft surfaces."""
@@ -311,7 +315,7 @@ class SupportConfig:
     stability: Literal["area", "balance"] = "balance"
     """What decides: separating planes and r_s of eq. 1 (`area`, the paper's rules; everything on top of an
     object with r_s < r_s,min also supports it), or the forces that hold the scene at rest (`balance`)."""
-    draws: Count = 12
+    draws: Annotated[Repeats, Field(ge=1)] = 12
     """Number of scenes sampled from the fits' uncertainty [1]; a probability near 0.5 is accurate to 0.14."""
     force_share: Share = 0.03
     """Minimum share of an object's weight [1] that a supporter bears in a sample, as in the ground truth."""
@@ -357,7 +361,7 @@ class VoxelConfig:
 
     size: Positive = 0.01
     """Edge of a voxel [m]; the paper's leaf size."""
-    max_voxels: Count = 64_000_000
+    max_voxels: Most = 64_000_000
     """Maximum number of voxels [1]: 25 times the default map; such a map takes 128 MB."""
     extent: Annotated[
         tuple[Positive, Positive, Positive], AfterValidator(_few_voxels), Field(validate_default=True)
@@ -522,7 +526,7 @@ class PhysicsConfig:
     """Rotation above which an object has moved [deg]."""
     max_copies: Count = 1000
     """Maximum number of copies of one element of an MJCF file [1]; 1,000 settle in 4 s."""
-    max_cells: Count = 4_000_000
+    max_cells: Most = 4_000_000
     """Maximum number of height field cells or texture pixels in an MJCF file [1]: 0.2 GB."""
 
 
@@ -560,7 +564,7 @@ class ReportConfig:
 class RecordingConfig:
     """Selection of the frames of a recording that become views."""
 
-    max_pixels: Count = 16_000_000
+    max_pixels: Most = 16_000_000
     """Maximum number of pixels of any image [1]; bounds memory, several times a depth camera's."""
     max_views: Count = 30
     """Maximum number of views [1]; those farthest apart are kept. A table needs 5 to 10."""
@@ -600,7 +604,7 @@ class ExportConfig:
 class SessionConfig:
     """Limits on the files of a session and on the sessions of a service."""
 
-    max_bytes: Count = 100_000_000
+    max_bytes: Most = 100_000_000
     """Maximum size of a file [bytes]; larger than any camera's image."""
     max_sessions: Count = 1000
     """Maximum number of sessions of a service [1]; their folders remain until deleted by hand."""

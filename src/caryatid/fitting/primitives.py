@@ -286,7 +286,7 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
     return best
 
 
-@kernel(inline="always")
+@inner
 def _judge(kind, shape, points, normals, threshold, least, min_extent, seen):  # type: ignore[no-untyped-def]
     """Find the sides that points confirm, draw the others in to where the points end, and score the shape.
 

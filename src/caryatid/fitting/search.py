@@ -7,7 +7,7 @@ import numpy as np
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile, select
 from caryatid.geometry.signed_distance import gradient, local
-from caryatid.runtime.parallel import inner, kernel
+from caryatid.runtime.parallel import inner
 
 TRIM = 0.005
 """Share of the points beyond each end of an extent that counts as noise [1]."""
@@ -15,7 +15,7 @@ LEAST_EXTENT, LEAST_RADIUS = 1e-4, 1e-3
 """Minimum extent and radius of hypotheses [m]; points on one plane have none across it."""
 
 
-@kernel(inline="always")
+@inner
 def search(  # type: ignore[no-untyped-def]
     kind, points, normals, samples, keep, threshold, max_radius, max_extent, min_extent, shapes
 ):
@@ -187,7 +187,7 @@ def _set_axes(R, ux, uy, uz, x, y, z, column):  # type: ignore[no-untyped-def]
     R[2, 1 - column] = sign * (x * uy - y * ux)
 
 
-@kernel(inline="always")
+@inner
 def _turned(R, c, s):  # type: ignore[no-untyped-def]
     """The direction between the first two axes by cosine and sine."""
     return c * R[0, 0] + s * R[0, 1], c * R[1, 0] + s * R[1, 1], c * R[2, 0] + s * R[2, 1]
@@ -227,7 +227,7 @@ def _main_normal(normals):  # type: ignore[no-untyped-def]
     return (u / length, v / length, w / length), agree
 
 
-@kernel(inline="always")
+@inner
 def _cosine(normals, i, j):  # type: ignore[no-untyped-def]
     return normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
 

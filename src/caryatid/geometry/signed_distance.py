@@ -15,7 +15,7 @@ GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 """Angle by which one point of a ball is turned relative to the last [rad]."""
 
 
-@kernel(inline="always")
+@inner
 def copy(shape, target):  # type: ignore[no-untyped-def]
     """Copy axes, centre and half extents (5, 3); an assignment of slices takes seconds to compile."""
     for i in range(5):
@@ -23,7 +23,7 @@ def copy(shape, target):  # type: ignore[no-untyped-def]
             target[i, j] = shape[i, j]
 
 
-@kernel(inline="always")
+@inner
 def local(R, centre, points, i):  # type: ignore[no-untyped-def]
     """Coordinates in the object's frame of one of the points (N, 3)."""
     u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
@@ -65,7 +65,7 @@ def distances_and_gradients(kind, R, centre, half, points):  # type: ignore[no-u
     return distance, gradients
 
 
-@kernel(inline="always")
+@inner
 def gradient(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
     """Signed distance [m] of one point in the object's frame, and its gradient (3) there."""
     if kind == SPHERE:

@@ -82,8 +82,8 @@ def compile_kernels() -> None:
 
 def warm_up(locks: str, number: int) -> None:
     """Call all kernels, starting at one by the process's number; several take turns by locks in a folder."""
-    # A compiler makes many long-lived objects; looking for garbage among them takes a tenth of its time.
-    gc.set_threshold(200_000, 50, 100)
+    # A compiler makes many long-lived objects; looking for garbage among them takes a sixth of its time.
+    gc.disable()
     _take_turns(Path(locks))
     call("warm-up", number)
 

@@ -21,12 +21,12 @@ from caryatid.simulation.setup import Simulation, make_simulation
 def warm_up(number: int) -> None:
     """Fit shapes, explore with and without fits and given segments, use all planners, and take a point cloud.
 
-    The number decides which of these comes first; the others follow in turn. Fitting takes nearly as long to
-    compile as all the rest, so another process begins with what needs no fits.
+    Fitting takes nearly as long to compile as all the rest. So processes with even numbers begin with what
+    needs no fits, and the others go through the parts in reverse order: they meet in the middle.
     """
     parts = [_explore_without_fits, _explore_by_colour_and_depth, _explore_with_labels, _fit]
-    for n in range(len(parts)):
-        parts[(n - number) % len(parts)]()
+    for part in parts if number % 2 == 0 else parts[::-1]:
+        part()
 
 
 def _explore_without_fits() -> None:
@@ -40,17 +40,15 @@ def _fit() -> None:
 
 
 def _explore_by_colour_and_depth(min_points: int = 12) -> None:
-    config, simulation, steps = _explore("dense-12-0", "auto", min_points)
+    config, simulation, _ = _explore("auto", min_points)
     scene = Scene(config, segmentation="auto")
-    for step in steps:
-        if step.view is not None:
-            scene.update(step.view)
+    scene.update(simulation.camera.capture(simulation.robot.T_world_camera))
     for planner in BUILT_IN:
         next_best_view(scene, simulation.robot, planner=planner)
 
 
 def _explore_with_labels() -> None:
-    config, _, steps = _explore("tower", "labels")
+    config, _, steps = _explore("labels")
     cloud = steps[0].cloud
     labels = cloud.labels
     Scene(config).update(replace(cloud, labels=None))
@@ -58,16 +56,14 @@ def _explore_with_labels() -> None:
         Scene(config).update(replace(cloud, labels=np.where(labels == SUPPORT_LABEL, 0, labels)))
 
 
-def _explore(
-    name: str, segmentation: SegmentationMethod, min_points: int = 12
-) -> tuple[Config, Simulation, list[Step]]:
+def _explore(segmentation: SegmentationMethod, min_points: int = 12) -> tuple[Config, Simulation, list[Step]]:
     """Explore with a quarter of the usual image size, fitting objects with at least `min_points`."""
     config = Config(
         sensor=SensorConfig(width=160, height=120, focal=131.25),
-        active=replace(Config().active, sphere_points=400, max_views=3),
+        active=replace(Config().active, sphere_points=400, max_views=2),
         voxels=VoxelConfig(size=0.02),
         fit=FitConfig(min_points=min_points),
     )
-    simulation = make_simulation(load_scene(name), config, noise="carmine", seed=0)
+    simulation = make_simulation(load_scene("tower"), config, noise="carmine", seed=0)
     steps = explore(simulation.camera, simulation.robot, config=config, segmentation=segmentation)
     return config, simulation, list(steps)
