@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 
 import numpy as np
+from scipy.ndimage import binary_erosion
 
 from caryatid.config import Config, SurfaceConfig
 from caryatid.errors import WrongViewError
@@ -76,16 +77,17 @@ def check_masks(view: View, eye_world: Array | None, surface: SupportSurface, co
     """
     assert view.labels is not None
     assert eye_world is not None
-    masks, middle = view.labels, view.labels[1:-1, 1:-1]
-    # At the borders of masks, sensors often have no reading.
-    inner = (middle == masks[:-2, 1:-1]) & (middle == masks[2:, 1:-1])
-    inner &= (middle == masks[1:-1, :-2]) & (middle == masks[1:-1, 2:])
-    pixels = np.bincount(middle[inner])
-    readings = np.bincount(middle[inner], view.depth[1:-1, 1:-1][inner] > 0.0)
     distance = np.linalg.norm(eye_world - surface.point_world)
-    large = pixels * (distance / view.K[0, 0]) ** 2 >= config.segmentation.min_area
-    lost = np.flatnonzero(large & (readings < config.fit.min_points))
-    if names := ", ".join(str(label) for label in lost if label != 0):
+    enough = config.segmentation.min_area / (distance / view.K[0, 0]) ** 2
+    unread = np.bincount(view.labels[(view.depth <= 0.0) & (view.labels > 0)])
+    lost = []
+    for label in np.flatnonzero(unread > max(enough - config.fit.min_points, 0)):
+        # At the borders of masks, sensors often have no reading.
+        inner = binary_erosion(view.labels == label)
+        readings = np.count_nonzero(view.depth[inner])
+        if np.count_nonzero(inner) >= enough and readings < config.fit.min_points:
+            lost.append(label)
+    if names := ", ".join(map(str, lost)):
         log.warning("%s: too few depth readings in mask %s; its object is missed", view.name, names)
 
 
