@@ -11,7 +11,7 @@ from caryatid.fitting.least_squares import CONVERGED, NOISE_FLOOR, levenberg_mar
 from caryatid.fitting.search import TRIM
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile
-from caryatid.geometry.shapes import Primitives, Shape, Uncertainty
+from caryatid.geometry.shapes import Shape, Uncertainty
 from caryatid.geometry.signed_distance import in_frame, signed_distances
 from caryatid.geometry.transforms import Array, rigid
 from caryatid.runtime.parallel import kernel
@@ -38,7 +38,7 @@ def close_hidden_faces(
     # error of registration.
     points = points[np.linspace(0, len(points) - 1, min(len(points), 3500)).astype(np.intp)]
     origin = points.mean(axis=0)
-    kind, axes, centre, half = Primitives.of([shape]).row(0)
+    kind, axes, centre, half = shape.row
     # If no step of least squares was better yet, a shape may still be below the shortest extent.
     points, kept = points - origin, np.stack([centre - origin, np.maximum(half, config.min_extent / 2.0)])
     hidden = ~np.array(seen).reshape(3, 2) & (kind != SPHERE)

@@ -14,7 +14,7 @@ from caryatid.fitting.least_squares import CONVERGED, levenberg_marquardt
 from caryatid.fitting.search import TRIM, search
 from caryatid.geometry import BOX, CYLINDER, SPHERE, transforms
 from caryatid.geometry.points import quantile
-from caryatid.geometry.shapes import KINDS, Primitives, Shape, Uncertainty
+from caryatid.geometry.shapes import KINDS, Shape, Uncertainty
 from caryatid.geometry.signed_distance import copy, gradient, in_frame, sample_surface
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import inner, kernel
@@ -180,7 +180,7 @@ def _finite(points: Array, normals: Array) -> tuple[Array, Array]:
 
 def _with_bare(f: Fit, points: Array) -> Fit:
     """A fit that has paid for the share of the sides seen that is bare of points (N, 3): 3 mm if all are."""
-    bare = _bare_share(*Primitives.of([f.shape]).row(0), np.array(f.seen), points)
+    bare = _bare_share(*f.shape.row, np.array(f.seen), points)
     return replace(f, cost=f.cost + 0.003 * bare)
 
 

@@ -9,6 +9,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import product
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -20,6 +21,12 @@ from caryatid.geometry.signed_distance import distances_and_gradients, sample_su
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.display import Pictured
 
+_BOX_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
+"""Corners (8, 3) of a box, in half extents."""
+_CYLINDER_RIMS = np.array(
+    [(math.cos(a), math.sin(a), end) for end in (1.0, -1.0) for a in 2.0 * np.pi * np.arange(24) / 24]
+)
+"""Points (48, 3) of a cylinder's rims, in radii and half heights."""
 _BOX_EDGES = np.array([(i, i + bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
 _CYLINDER_EDGES = np.concatenate(
     [[(i, i + 24), (i, (i + 1) % 24), (i + 24, (i + 1) % 24 + 24)] for i in range(24)]
@@ -108,6 +115,12 @@ class Shape(Pictured):
         return (self,)
 
     @property
+    def row(self) -> tuple[int, Array, Array, Array]:
+        """Code, axes (3, 3), centre (3,) [m] and half extents (3,) [m], for the compiled kernels."""
+        T = self.T_world_object
+        return self.code, np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), self.extents / 2.0
+
+    @property
     def centre_of_mass(self) -> Array:
         """Centre of mass (3,) [m] in the world, of a uniform density."""
         return self.T_world_object[:3, 3]
@@ -148,7 +161,7 @@ class Shape(Pictured):
     def signed_distance(self, points_world: Array) -> Array:
         """Distance (N,) [m] of points (N, 3) to the surface, negative inside."""
         points = np.ascontiguousarray(points_world, np.float64)
-        distances: Array = signed_distances(*Primitives.of([self]).row(0), points)
+        distances: Array = signed_distances(*self.row, points)
         return distances
 
     def support(self, directions_world: Array) -> Array:
@@ -166,7 +179,7 @@ class Shape(Pictured):
         if not 2.0 * (x * y + y * z + z * x) <= MOST_SAMPLES:
             reason = f"is too fine for a {self.kind} of {max(self.extents):.3g} m"
             raise InputError(f"a spacing of {spacing:.3g} m", reason, "give a larger spacing")
-        points, normals = sample_surface(*Primitives.of([self]).row(0), float(spacing))
+        points, normals = sample_surface(*self.row, float(spacing))
         return points, normals
 
     def mesh(self, corners: int = 48) -> Any:
@@ -263,8 +276,7 @@ class Box(Shape):
 
     def outline(self) -> Array:
         """The eight corners (8, 3) [m]."""
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
-        return transforms.transform(self.T_world_object, signs * self.extents / 2.0)
+        return transforms.transform(self.T_world_object, _BOX_CORNERS * self.extents / 2.0)
 
     def cap(self, direction_world: Array, depth: float) -> Array:
         """Outline (M, 2) [m] on the ground of the part within `depth` [m] of its end in a direction (3,)."""
@@ -318,10 +330,8 @@ class Cylinder(Shape):
 
     def outline(self) -> Array:
         """Two regular 24-gons (48, 3) [m] around the ends."""
-        angle = 2.0 * np.pi * np.arange(24) / 24
-        ring = np.stack([self.radius * np.cos(angle), self.radius * np.sin(angle), np.zeros(24)], axis=-1)
-        end = np.array([0.0, 0.0, self.height / 2.0])
-        return transforms.transform(self.T_world_object, np.concatenate([ring + end, ring - end]))
+        size = (self.radius, self.radius, self.height / 2.0)
+        return transforms.transform(self.T_world_object, _CYLINDER_RIMS * size)
 
     def cap(self, direction_world: Array, depth: float) -> Array:
         """Outline (M, 2) [m] on the ground of the part within `depth` [m] of its end in a direction (3,)."""

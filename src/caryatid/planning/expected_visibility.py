@@ -42,6 +42,11 @@ class Samples:
     subjects: NDArray[np.intp]
     names: tuple[str, ...]
 
+    def select(self, which: NDArray[np.bool_]) -> Samples:
+        """Return some of the points (K,); all names remain."""
+        points, normals = self.points_world[which], self.normals_world[which]
+        return Samples(points, normals, self.weights[which], self.subjects[which], self.names)
+
 
 def join(parts: Sequence[Samples]) -> Samples:
     """Put samples together; each part keeps its own names."""
@@ -114,14 +119,16 @@ def space_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
     lattice = np.meshgrid(*(np.arange(a, b, spacing) for a, b in zip(low, high, strict=True)))
     points = np.stack(lattice, axis=-1).reshape(-1, 3)
     T, half = table.shape.T_world_object, table.shape.extents / 2.0
-    points = points[(np.abs((points - T[:3, 3]) @ T[:3, :2]) <= half[:2]).all(axis=1)]
+    x, y = np.abs((points - T[:3, 3]) @ T[:3, :2]).T
+    points = points[(x <= half[0]) & (y <= half[1])]
 
     outlines = [o.shape.footprint() for o in graph.objects if o.role == "object"]
     heap = shapely.Polygon(hull(np.concatenate(outlines)))
     shapely.prepare(heap)
     worth = 1.0 - (points[:, 2] - low[2]) / (high[2] - low[2])
     worth_in_heap = np.where(shapely.contains_xy(heap, points[:, :2]), worth, 0.0)
-    unseen = (occluders.voxels.state_at(points) == UNKNOWN) & ~occluders.holds(points)
+    unseen = occluders.voxels.state_at(points) == UNKNOWN
+    unseen[unseen] = ~occluders.holds(points[unseen])
     on_table, in_heap = (w[unseen] / max(float(w.sum()), 1e-9) for w in (worth, worth_in_heap))
     anywhere, one_subject = np.zeros((len(on_table), 3)), np.zeros(len(on_table), dtype=np.intp)
     return Samples(points[unseen], anywhere, SPACE_WEIGHT * on_table + in_heap, one_subject, (SPACE,))

@@ -162,7 +162,7 @@ class VoxelMap:
                 inside = shape.signed_distance(origin_world + size * (index + 0.5)) < 0.0
                 grid[tuple(index[inside].T)] = 1
                 high[number] = low[number]
-        _fill(*arrays, low, high, grid, origin_world, size)
+        for_each(_fill, SHARES, (*arrays, low, high, grid, origin_world, size))
         return Occluders(origin_world, grid, self)
 
     def cut(self, low_world: Array, high_world: Array) -> VoxelMap:
@@ -281,10 +281,10 @@ def _indices(low: NDArray[np.intp], high: NDArray[np.intp]) -> NDArray[np.intp]:
 
 def _values_at(grid: NDArray[np.int8], points: Array, origin: Array, size: float) -> NDArray[np.int8]:
     """Values (N,) that the voxels of a grid (X, Y, Z) hold at points (N, 3) [m]; 0 outside."""
-    index = np.floor((points - origin) / size).astype(np.intp)
-    inside = ((index >= 0) & (index < grid.shape)).all(axis=1)
-    values = np.zeros(len(index), dtype=np.int8)
-    values[inside] = grid[tuple(index[inside].T)]
+    index = np.floor((points - origin).T / size).astype(np.intp)
+    inside = ((index >= 0) & (index < np.reshape(grid.shape, (3, 1)))).all(axis=0)
+    values = np.zeros(len(points), dtype=np.int8)
+    values[inside] = grid[tuple(index[:, inside])]
     return values
 
 
@@ -357,11 +357,12 @@ def _count_marks(share, data):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fill(kinds, R, centres, half, low, high, grid, origin, size):  # type: ignore[no-untyped-def]
-    """Mark the voxels of a grid whose centres are inside one of N shapes, if low ≤ index < high (N, 3)."""
+def _fill(share, data):  # type: ignore[no-untyped-def]
+    """Mark a share of the voxels whose centres are inside one of N shapes, if low ≤ index < high (N, 3)."""
+    kinds, R, centres, half, low, high, grid, origin, size = data
     centre = np.empty((1, 3))
     for s in range(len(kinds)):
-        for i in range(low[s, 0], high[s, 0]):
+        for i in range(low[s, 0] + share, high[s, 0], SHARES):
             centre[0, 0] = origin[0] + (i + 0.5) * size
             for j in range(low[s, 1], high[s, 1]):
                 centre[0, 1] = origin[1] + (j + 0.5) * size
@@ -391,13 +392,17 @@ def _face(data, p, first, end):  # type: ignore[no-untyped-def]
     _, _, _, points, normals, befores, weights, eyes, axes, _, cone, worths = data
     x, y, z = points[p, 0], points[p, 1], points[p, 2]
     a, b, c = normals[p, 0], normals[p, 1], normals[p, 2]
-    before, weight, worth = befores[p], weights[p], worths[p]
+    before, weight = befores[p], weights[p]
     around = a == 0.0 and b == 0.0 and c == 0.0
-    for n in range(first, end):
-        dx, dy, dz = eyes[0, n] - x, eyes[1, n] - y, eyes[2, n] - z
+    # Separate slices let the compiler treat many cameras at once.
+    eye_x, eye_y, eye_z = eyes[0, first:end], eyes[1, first:end], eyes[2, first:end]
+    axis_x, axis_y, axis_z = axes[0, first:end], axes[1, first:end], axes[2, first:end]
+    worth = worths[p, first:end]
+    for n in range(len(worth)):
+        dx, dy, dz = eye_x[n] - x, eye_y[n] - y, eye_z[n] - z
         distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
         facing = 1.0 if around else min((a * dx + b * dy + c * dz) / (distance * FULLY), 1.0)
-        along = -(axes[0, n] * dx + axes[1, n] * dy + axes[2, n] * dz)
+        along = -(axis_x[n] * dx + axis_y[n] * dy + axis_z[n] * dz)
         new = facing - before
         worth[n] = weight * new if new > 0.0 and along >= cone * distance else 0.0
 

@@ -75,7 +75,7 @@ class SupportPlanner:
 def _expected_gain(
     state: PlanningState, relations: list[PointOfInterest], T_world_camera: Array
 ) -> tuple[Samples, Array]:
-    """Samples, and what cameras (C, 4, 4) show of them for the first time (K, C)."""
+    """Samples of what is still hidden, and what cameras (C, 4, 4) show of them for the first time (K, C)."""
     config = state.config
     occluders = state.voxels.occluders([o.shape for o in state.graph.objects])
     surfaces, points = surface_samples(state.graph, occluders), relation_samples(relations)
@@ -89,7 +89,9 @@ def _expected_gain(
     samples = join([surfaces, points, space])
     samples = replace(samples, weights=samples.weights * matter(samples, state.graph, state.goal))
     before = np.concatenate([seen, np.zeros(len(space.weights))])
-    return samples, newly_visible(samples, before, T_world_camera, occluders, config)
+    new = samples.weights * (1.0 - before) > 0.0
+    samples = samples.select(new)
+    return samples, newly_visible(samples, before[new], T_world_camera, occluders, config)
 
 
 def _on_sphere(
