@@ -398,19 +398,27 @@ class _DrawnScene:
             moved = strayed(seen, state, config.moved, config.turned) & ~self.unstable
             self.unstable |= moved
         self._state = np.where(self.unstable[:, None], seen, state)
+        self._lifts: dict[tuple[str, ...], Lift] = {}
 
-    def lift(self, object_id: str, hold: Collection[str]) -> Lift:
-        """Lift an object while others are held, and those that do not stay in place."""
-        index = self._ids.index(object_id)
-        held = {self._ids.index(i) for i in hold} | ({*np.flatnonzero(self.unstable).tolist()} - {index})
-        return self._lifting.lift(self._state, index, self._config, held=held, to_the_end=False)
+    def lift(self, object_id: str, hold: Sequence[str]) -> Lift:
+        """Lift an object while others are held, and those that do not stay in place; cached.
 
-    def take(self, object_id: str, hold: Collection[str]) -> None:
+        The film has the final state only.
+        """
+        if (object_id, *hold) not in self._lifts:
+            index = self._ids.index(object_id)
+            held = {self._ids.index(i) for i in hold} | ({*np.flatnonzero(self.unstable).tolist()} - {index})
+            lift = self._lifting.lift(self._state, index, self._config, held=held, to_the_end=False)
+            self._lifts[object_id, *hold] = Lift(lift.disturbed, lift.film[-1:].copy())
+        return self._lifts[object_id, *hold]
+
+    def take(self, object_id: str, hold: Sequence[str]) -> None:
         """Continue without an object; others that moved are put back."""
         lift, index = self.lift(object_id, hold), self._ids.index(object_id)
         stays = self.unstable | lift.disturbed.any()
         self._state = np.where(stays[:, None], self._state, lift.film[-1])
         self._state[index, :3] = 0.0, 0.0, ASIDE + index
+        self._lifts.clear()
 
 
 def _drawn_bodies(

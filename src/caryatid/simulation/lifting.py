@@ -107,10 +107,12 @@ class Lifting:
         """Lift an object of a state (N, 7) straight up, put it aside and observe the others.
 
         Some objects may be held in place meanwhile. If it need not go on to the end, it stops as soon as an
-        object is disturbed or all are at rest.
+        object is disturbed or all are at rest, and does not begin if there are no others.
         """
         watched = state[:, 2] < ASIDE / 2.0
         watched[index] = False
+        if not to_the_end and not watched.any():
+            return Lift(watched, state[None])
         data = self._data(state, [*held, index])
         # Up until the object's lowest point is 2 cm above all others.
         low, _ = self._span(data, index)
