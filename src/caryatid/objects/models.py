@@ -45,7 +45,8 @@ OtherColour = Callable[[int, NDArray[np.intp]], NDArray[np.bool_]]
 class ObjectPoints:
     """What has been seen of each object, and of the support surface, so far; grows with every view.
 
-    The points of one object are in the order of their views, those taken over from another one behind them.
+    The points are grouped by object. Those of one object are in the order of their views, and those taken
+    over from another one come after them.
 
     Attributes:
         labels_used: The highest label an object ever had; new ones are numbered from the next one.
@@ -77,7 +78,7 @@ class ObjectPoints:
         )
         self._views = np.concatenate([self._views, np.full(len(cloud), view)])
         changed = set(np.unique(labels).tolist())
-        self._relabel(np.concatenate([self._labels, labels]), changed)
+        self._keep(np.arange(len(self._cloud)), np.concatenate([self._labels, labels]), changed)
         self.labels_used = max(self.labels_used, *(changed - {SUPPORT_LABEL}), 0)
 
     def put(self, cloud: Cloud, label: int, view: int) -> None:
@@ -94,23 +95,23 @@ class ObjectPoints:
 
     def of(self, label: int, edge: float = 0.0) -> Cloud:
         """Points of an object: all, or of those in each voxel of this edge [m] the one nearest their mean."""
+        if not edge:
+            rows, cloud = self._rows(label), self._cloud
+            rgb = None if cloud.rgb is None or label in self._colourless else cloud.rgb[rows]
+            return Cloud(cloud.points_world[rows], cloud.normals_world[rows], self._labels[rows], rgb)
         if (label, edge) not in self._selected:
-            if edge:
-                cloud = self.of(label)
-                self._selected[label, edge] = cloud.select(thin(cloud.points_world, edge))
-            else:
-                cloud = self._select(np.flatnonzero(self._labels == label))
-                self._selected[label, edge] = replace(cloud, rgb=None) if label in self._colourless else cloud
+            cloud = self.of(label)
+            self._selected[label, edge] = cloud.select(thin(cloud.points_world, edge))
         return self._selected[label, edge]
 
     def newest(self, label: int) -> Cloud:
         """Points of an object in the newest view that showed it."""
-        rows = np.flatnonzero(self._labels == label)
-        return self._select(rows[self._views[rows] == self._views[rows[-1]]])
+        views = self._views[self._rows(label)]
+        return self.of(label).select(views == views[-1])
 
     def everything(self) -> Cloud:
-        """All points of all objects and of the support surface, with labels."""
-        return self._select(np.argsort(self._labels, kind="stable"))
+        """A copy of all points of all objects and of the support surface, with labels."""
+        return replace(self._cloud, labels=self._labels).select(np.arange(len(self._labels)))
 
     def bound(self, voxels: Mapping[int, float], depth: int) -> None:
         """Leave objects that more than twice `depth` views show the newest `depth` points in each voxel.
@@ -121,18 +122,18 @@ class ObjectPoints:
             return
         kept, changed = np.ones(len(self._labels), dtype=np.bool_), set()
         for label, edge in voxels.items():
-            rows = np.flatnonzero(self._labels == label)
+            rows = self._rows(label)
             if np.count_nonzero(np.bincount(self._views[rows])) > 2 * depth:
                 kept[rows] = False
-                kept[rows[last_in_voxels(self._cloud.points_world[rows], edge, depth)]] = True
+                kept[rows][last_in_voxels(self._cloud.points_world[rows], edge, depth)] = True
                 changed.add(label)
         if changed:
-            self._reorder(np.flatnonzero(kept), self._labels, changed)
+            self._keep(np.flatnonzero(kept), self._labels, changed)
 
     def forget(self, labels: set[int]) -> None:
         """Drop the points of some objects."""
         kept = np.flatnonzero(~np.isin(self._labels, sorted(labels)))
-        self._reorder(kept, self._labels, labels)
+        self._keep(kept, self._labels, labels)
 
     def relocate(self, label: int, T: Array) -> None:
         """Move the points of an object by T (4, 4)."""
@@ -154,7 +155,7 @@ class ObjectPoints:
         self._colourless |= {new} if old in self._colourless else set()
         # Stable: of the two, the points of the new one come first.
         order = np.argsort(np.where(self._labels == old, 2, self._labels == new), kind="stable")
-        self._reorder(order, np.where(self._labels == old, np.int32(new), self._labels), {old, new})
+        self._keep(order, np.where(self._labels == old, np.int32(new), self._labels), {old, new})
 
     def divide(self, label: int, groups: NDArray[np.intp]) -> list[int]:
         """Make an object of each group (N,), from 0, of the points of `of(label)`.
@@ -164,30 +165,29 @@ class ObjectPoints:
         """
         names = [label, *range(self.labels_used + 1, self.labels_used + 1 + int(groups.max()))]
         labels = self._labels.copy()
-        labels[labels == label] = np.array(names)[groups]
-        self._relabel(labels, set(names))
+        labels[self._rows(label)] = np.array(names)[groups]
+        self._keep(np.arange(len(labels)), labels, set(names))
         self.labels_used = max(self.labels_used, *names)
         return names
 
-    def _select(self, rows: NDArray[np.intp]) -> Cloud:
-        return replace(self._cloud.select(rows), labels=self._labels[rows])
+    def _rows(self, label: int) -> slice:
+        return slice(*(int(np.searchsorted(self._labels, label, side)) for side in ("left", "right")))
 
     def _transform(self, poses: Array, which: NDArray[np.intp], changed: set[int]) -> None:
         """Move each point by one (N,) of some poses (K, 4, 4); forget what was selected of some labels."""
         points = transform(poses, which, self._cloud.points_world)
         normals = rotate(poses, which, self._cloud.normals_world)
         self._cloud = replace(self._cloud, points_world=points, normals_world=normals)
-        self._relabel(self._labels, changed)
+        self._forget(changed)
 
-    def _reorder(self, rows: NDArray[np.intp], labels: NDArray[np.int32], changed: set[int]) -> None:
+    def _keep(self, rows: NDArray[np.intp], labels: NDArray[np.int32], changed: set[int]) -> None:
         """Keep these rows, in this order, with the labels (N,) of all; forget what was selected of some."""
-        self._cloud, self._views = self._cloud.select(rows), self._views[rows]
-        self._relabel(labels[rows], changed)
+        rows = rows[np.argsort(labels[rows], kind="stable")]
+        self._cloud, self._views, self._labels = self._cloud.select(rows), self._views[rows], labels[rows]
+        self._forget(changed)
 
-    def _relabel(self, labels: NDArray[np.int32], changed: set[int]) -> None:
-        """Set all points' labels (N,), and forget what was selected of some."""
-        self._labels = labels
-        self._selected = {key: held for key, held in self._selected.items() if key[0] not in changed}
+    def _forget(self, labels: set[int]) -> None:
+        self._selected = {key: held for key, held in self._selected.items() if key[0] not in labels}
 
 
 class ObjectModels:
