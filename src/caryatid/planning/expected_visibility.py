@@ -116,22 +116,24 @@ def space_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
         return relation_samples(())
     low, high = corners
     spacing = 4.0 * occluders.voxels.config.size
-    lattice = np.meshgrid(*(np.arange(a, b, spacing) for a, b in zip(low, high, strict=True)))
-    points = np.stack(lattice, axis=-1).reshape(-1, 3)
+    x, y, z = (np.arange(a, b, spacing) for a, b in zip(low, high, strict=True))
+    places = np.stack(np.meshgrid(x, y, table.centre_world[2]), axis=-1).reshape(-1, 3)
     T, half = table.shape.T_world_object, table.shape.extents / 2.0
-    x, y = np.abs((points - T[:3, 3]) @ T[:3, :2]).T
-    points = points[(x <= half[0]) & (y <= half[1])]
+    places = places[(np.abs((places - T[:3, 3]) @ T[:3, :2]) <= half[:2]).all(axis=1)]
 
     outlines = [o.shape.footprint() for o in graph.objects if o.role == "object"]
     heap = shapely.Polygon(hull(np.concatenate(outlines)))
     shapely.prepare(heap)
-    worth = 1.0 - (points[:, 2] - low[2]) / (high[2] - low[2])
-    worth_in_heap = np.where(shapely.contains_xy(heap, points[:, :2]), worth, 0.0)
+    in_heap = shapely.contains_xy(heap, places[:, :2])
+    across = SPACE_WEIGHT / max(len(places), 1) + in_heap / max(np.count_nonzero(in_heap), 1)
+    upwards = 1.0 - (z - low[2]) / (high[2] - low[2])
+    weights = (across[:, None] * (upwards / upwards.sum())).ravel()
+    points = np.repeat(places, len(z), axis=0)
+    points[:, 2] = np.tile(z, len(places))
     unseen = occluders.voxels.state_at(points) == UNKNOWN
     unseen[unseen] = ~occluders.holds(points[unseen])
-    on_table, in_heap = (w[unseen] / max(float(w.sum()), 1e-9) for w in (worth, worth_in_heap))
-    anywhere, one_subject = np.zeros((len(on_table), 3)), np.zeros(len(on_table), dtype=np.intp)
-    return Samples(points[unseen], anywhere, SPACE_WEIGHT * on_table + in_heap, one_subject, (SPACE,))
+    points, weights = points[unseen], weights[unseen]
+    return Samples(points, np.zeros_like(points), weights, np.zeros(len(points), dtype=np.intp), (SPACE,))
 
 
 def relation_samples(points: Sequence[PointOfInterest]) -> Samples:
