@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from functools import cache, partial
-from itertools import combinations
+from itertools import combinations, compress
 from typing import Any
 
 import numpy as np
@@ -436,11 +436,14 @@ class ObjectModels:
         every = np.concatenate([table, *seen.values()])
         owners = np.repeat([SUPPORT_LABEL, *seen], [len(table), *map(len, seen.values())])
         tree = cKDTree(every)
+        shapes = {k: o.shape for k, o in self.fits.items()}
+        middles = np.array([s.T_world_object[:3, 3] for s in shapes.values()]).reshape(-1, 3)
+        radii = np.array([np.linalg.norm(s.extents) / 2.0 for s in shapes.values()])
 
         def formed(number: int) -> SceneObject | None:
             label = changed[number]
             evidence, explanation = self._explained(label, noise, voxels)
-            shape = self.fits[label].shape
+            shape = shapes[label]
             middle, size = shape.T_world_object[:3, 3], float(np.linalg.norm(shape.extents))
             near = np.array(tree.query_ball_point(middle, size / 2.0), dtype=np.intp)
             inside = shape.signed_distance(every[near[owners[near] != label]]) < -3.0 * noise
@@ -449,7 +452,9 @@ class ObjectModels:
             if explanation.shape is not None and explanation.cost + taken <= irregular.cost:
                 return None
             cloud = self.points.of(label, self._config.cloud.voxel)
-            others = [o.shape for k, o in self.fits.items() if k != label]
+            reach = size / 2.0 + radii + self._config.voxels.size
+            close = np.linalg.norm(middles - middle, axis=1) <= reach
+            others = [s for k, s in compress(shapes.items(), close) if k != label]
             return as_solid(self.fits[label], cloud, evidence, others, self._config.fit)
 
         for label, o in zip(changed, on_threads(formed, len(changed)), strict=True):

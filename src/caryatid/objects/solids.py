@@ -43,7 +43,7 @@ def as_solid(
         fitted: The object; it does not change if its points span no volume.
         cloud: Its points.
         evidence: Some of them, evenly spread, their noise, and the space seen free.
-        others: Shapes of the other objects.
+        others: Shapes of the other objects near it.
         config: `min_extent` is the thickness of a wall seen from one side.
     """
     places, outward = _smoothed(cloud, evidence)
@@ -72,11 +72,8 @@ def _unseen(shape: Shape, places: Array, others: Sequence[Shape], voxels: VoxelM
     low, high = places[:, 2].min(), places[:, 2].max()
     points = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
     points = points[voxels.state_at(points) == UNKNOWN]
-    middle, radius = shape.T_world_object[:3, 3], float(np.linalg.norm(shape.extents)) / 2.0
     for other in others:
-        reach = radius + float(np.linalg.norm(other.extents)) / 2.0 + voxels.config.size
-        if np.linalg.norm(other.T_world_object[:3, 3] - middle) <= reach:
-            points = points[other.signed_distance(points) > voxels.config.size]
+        points = points[other.signed_distance(points) > voxels.config.size]
     return points
 
 
