@@ -302,11 +302,11 @@ def full(*arguments, **named):
     raise OSError(28, "No space left on device")
 
 
-@pytest.mark.parametrize("place", ["write_file", "pickle.dumps"])
+@pytest.mark.parametrize("place", ["staged_file", "pickle.dump"])
 def test_without_a_usable_snapshot_no_view_is_lost(begun, views, tmp_path, monkeypatch, graph_after, place):
     """The disk takes no snapshots, or one came from elsewhere: it runs no code."""
     payload = pickle.dumps(Intruder(tmp_path / "touched"))
-    instead = full if place == "write_file" else lambda *_, **__: payload
+    instead = full if place == "staged_file" else lambda _, file, **__: file.write(payload)
     monkeypatch.setattr(f"caryatid.sessions.session.{place}", instead)
     with Session.open(begun) as session:
         session.add(views[2])

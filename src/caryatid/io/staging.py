@@ -9,6 +9,7 @@ import secrets
 import shutil
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedRandom
 from pathlib import Path
 from typing import Self
 
@@ -146,13 +147,27 @@ def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
     Raises:
         InputError: It is a folder, or the disk cannot be written; nothing is left behind.
     """
+    with staged_file(path, durable=durable) as file:
+        file.write(content)
+
+
+@contextmanager
+def staged_file(path: Path, *, durable: bool = False) -> Iterator[BufferedRandom]:
+    """Open a file to write and read; it takes its place, whole, when the block ends, as with `write_file`.
+
+    Raises:
+        InputError: As `write_file`.
+    """
     if path.is_dir():
         raise InputError(path, "is a directory", "give a file")
     recover(path)
     partial = _partial(path)
     with write_errors(path):
         try:
-            _write(partial, content, durable)
+            with partial.open("w+b") as file:
+                yield file
+            if durable:
+                sync(partial)
             partial.replace(path)
             if durable:
                 sync(path.parent)

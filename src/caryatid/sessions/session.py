@@ -12,7 +12,6 @@ Views and reports are written completely, then renamed into place; removal also 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import logging
 import pickle
@@ -22,6 +21,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
+from io import BufferedIOBase
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
@@ -46,6 +46,7 @@ from caryatid.io.staging import (
     recover,
     remove_file,
     remove_folder,
+    staged_file,
     sync,
     write_errors,
     write_file,
@@ -547,10 +548,11 @@ class Session:
     def _read_snapshot(self, events: Sequence[Event]) -> tuple[int, Scene | None]:
         """The newest snapshot that this code made of the first of these events, and their number."""
         for number in range(len(events), 0, -1):
-            with suppress(Exception):  # a damaged file may raise anything, and the events are still there
-                content = self._snapshot(number).read_bytes()
-                if content[:32] == self._seal(events[:number], content[32:]):
-                    scene = _Unpickler(io.BytesIO(content[32:])).load()
+            # A damaged file may raise anything, and the events are still there.
+            with suppress(Exception), self._snapshot(number).open("rb") as file:
+                if file.read(32) == self._seal(events[:number], file):
+                    file.seek(32)
+                    scene = _Unpickler(file).load()
                     if isinstance(scene, Scene):
                         return number, scene
         return 0, None
@@ -560,8 +562,13 @@ class Session:
         with suppress(Exception):
             path = self._snapshot(len(events))
             path.parent.mkdir(exist_ok=True)
-            payload = pickle.dumps(scene, protocol=5)
-            write_file(path, self._seal(events, payload) + payload)
+            with staged_file(path) as file:
+                file.write(bytes(32))
+                pickle.dump(scene, file, protocol=5)
+                file.seek(32)
+                seal = self._seal(events, file)
+                file.seek(0)
+                file.write(seal)
             kept = {self._snapshot(len(events) - back) for back in range(8)}
             for older in set(path.parent.iterdir()) - kept:
                 older.unlink()
@@ -569,11 +576,12 @@ class Session:
     def _snapshot(self, events: int) -> Path:
         return self.path / "state" / f"{events:06d}.pickle"
 
-    def _seal(self, events: Sequence[Event], payload: bytes) -> bytes:
-        """Digest of the code and the events that made a snapshot, and of the snapshot itself."""
+    def _seal(self, events: Sequence[Event], file: BufferedIOBase) -> bytes:
+        """Digest of the code and the events that made a snapshot, and of the rest of its file."""
         told = (e.digest if isinstance(e, CameraRecord) else e.to_json().decode() for e in events)
         made_of = " ".join((fingerprint(), self.beginning.to_json(), *told))
-        return hashlib.sha256(made_of.encode() + b"\0" + payload).digest()
+        digest = hashlib.sha256(made_of.encode() + b"\0")
+        return hashlib.file_digest(file, lambda: digest).digest()
 
 
 def _numbered(folder: Path) -> list[Path]:
