@@ -105,8 +105,9 @@ def write_docs(rows: Sequence[Row], folder: Path) -> None:
 def compare(rows_by_name: Mapping[str, Sequence[Row]], part: bool, console: Console) -> int:
     """Compare the ratios with the baseline, and return the exit status.
 
-    A measurement with a worse ratio is repeated, and the better figure counts: noise slows a run more often
-    than it speeds one up. Ratios that lack a peer are reported; the gate fails only if no ratio was measured.
+    A measurement with a worse ratio is repeated, and so is that of the machine's speed, and the better figure
+    counts: noise slows a run more often than it speeds one up. Ratios that lack a peer are reported; the gate
+    fails only if no ratio was measured.
     """
     known = read_baseline(BASELINE)
     found = {m.name: m for rows in rows_by_name.values() for m in measures(rows)}
@@ -118,6 +119,7 @@ def compare(rows_by_name: Mapping[str, Sequence[Row]], part: bool, console: Cons
     for name, rows in rows_by_name.items():
         if any(m.worse_than(known.get(m.name, m.value)) for m in measures(rows)):
             console.print(f"measuring {name} again, because a ratio is worse")
+            machine.cache_clear()
             for again in measures(MEASUREMENTS[name](FULL)):
                 found[again.name] = min(again, found.get(again.name, again), key=lambda m: m.value)
     return gate(found.values(), BASELINE, console)
