@@ -143,7 +143,7 @@ def test_many_views_leave_no_more_than_the_newest_points_of_a_place():
     points = ObjectPoints()
     for view in range(9):
         add(points, cloud(20, 1, 0.01 * view), view)
-        points.bound({1: 0.5}, 4)
+        points.bound({1: 0.5}, 8, 4)
         assert len(points.of(1)) == (20 * (view + 1) if view < 8 else 80)
     left = np.unique(np.round(points.of(1).points_world[:, 0] % 1.0, 9))
     np.testing.assert_array_equal(left, [0.05, 0.06, 0.07, 0.08])

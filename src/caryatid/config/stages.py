@@ -74,9 +74,10 @@ class CloudConfig:
     at 2.7 m with f = 525 px. Grows with pixel size in coarser images."""
     voxel: Positive = 0.005
     """Spacing of an object's points, pooled over views [m]; about the noise of one reading at 1.5 m."""
-    depth: Count = 5
-    """Points kept per voxel of an object that more than twice as many views show [1]; their mean has half the
-    noise."""
+    views: Count = 10
+    """Number of views whose segments and points are all kept [1]."""
+    depth: Count = 3
+    """Points kept per voxel of an object that more views show [1]; a fit uses the one nearest their mean."""
     neighbours: Count = 16
     """Number of neighbours that define the normal of a point in an unorganised cloud [1]."""
 

@@ -47,7 +47,27 @@ def fuse(
         if o.id not in names:
             names[o.id] = _fresh_id(o, taken)
             taken.add(names[o.id])
-    return (*graphs, renamed(graph, names)), names
+    graph = renamed(graph, names)
+    return (*(graphs if config.method == "sg" else _superseded(graphs, graph)), graph), names
+
+
+def _superseded(graphs: Graphs, newest: SupportGraph) -> Graphs:
+    """Keep of earlier graphs only what counts beside the newest one: ids, and probabilities of supports.
+
+    Without this, the memory of a long session would grow with its number of views.
+    """
+    objects, pairs = {o.id: o for o in newest.objects}, {s.pair for s in newest.supports}
+    return tuple(
+        SupportGraph(
+            tuple(objects.get(o.id, o) for o in g.objects),
+            tuple(_bare(s) if s.why and s.pair in pairs else s for s in g.supports),
+        )
+        for g in graphs
+    )
+
+
+def _bare(s: Support) -> Support:
+    return replace(s, contact_world=None, normal_world=None, why="")
 
 
 def renamed(graph: SupportGraph, names: Mapping[str, str]) -> SupportGraph:

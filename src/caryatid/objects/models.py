@@ -56,7 +56,7 @@ class ObjectPoints:
         self.labels_used = 0
         self._cloud = Cloud(np.zeros((0, 3)), np.zeros((0, 3)))
         self._labels = np.zeros(0, dtype=np.int32)
-        self._views = np.zeros(0, dtype=np.intp)
+        self._views = np.zeros(0, dtype=np.int32)
         self._colourless: frozenset[int] = frozenset()
         self._selected: dict[tuple[int, float], Cloud] = {}
 
@@ -68,17 +68,21 @@ class ObjectPoints:
 
     def add(self, cloud: Cloud, labels: NDArray[np.int32], view: int) -> None:
         """Add a view's points with their labels (N,); colours stay where all points have them."""
-        known, rgb = self._cloud, cloud.rgb
+        order = np.argsort(labels, kind="stable")
+        labels, cloud, known = labels[order], cloud.select(order), self._cloud
+        after = np.searchsorted(self._labels, labels, side="right")
+        rgb = cloud.rgb
         if len(known) and rgb is not None:
-            rgb = None if known.rgb is None else np.concatenate([known.rgb, rgb])
+            rgb = None if known.rgb is None else np.insert(known.rgb, after, rgb, axis=0)
         self._cloud = Cloud(
-            np.concatenate([known.points_world, cloud.points_world]),
-            np.concatenate([known.normals_world, cloud.normals_world]),
+            np.insert(known.points_world, after, cloud.points_world, axis=0),
+            np.insert(known.normals_world, after, cloud.normals_world, axis=0),
             rgb=rgb,
         )
-        self._views = np.concatenate([self._views, np.full(len(cloud), view)])
+        self._views = np.insert(self._views, after, view)
+        self._labels = np.insert(self._labels, after, labels)
         changed = set(np.unique(labels).tolist())
-        self._keep(np.arange(len(self._cloud)), np.concatenate([self._labels, labels]), changed)
+        self._forget(changed)
         self.labels_used = max(self.labels_used, *(changed - {SUPPORT_LABEL}), 0)
 
     def put(self, cloud: Cloud, label: int, view: int) -> None:
@@ -113,17 +117,17 @@ class ObjectPoints:
         """A copy of all points of all objects and of the support surface, with labels."""
         return replace(self._cloud, labels=self._labels).select(np.arange(len(self._labels)))
 
-    def bound(self, voxels: Mapping[int, float], depth: int) -> None:
-        """Leave objects that more than twice `depth` views show the newest `depth` points in each voxel.
+    def bound(self, voxels: Mapping[int, float], views: int, depth: int) -> None:
+        """Leave objects that more than this number of views show the newest `depth` points in each voxel.
 
         `voxels` are the objects and the edge lengths of their voxels [m].
         """
-        if self._views.max(initial=0) < 2 * depth:
+        if self._views.max(initial=0) < views:
             return
         kept, changed = np.ones(len(self._labels), dtype=np.bool_), set()
         for label, edge in voxels.items():
             rows = self._rows(label)
-            if np.count_nonzero(np.bincount(self._views[rows])) > 2 * depth:
+            if np.count_nonzero(np.bincount(self._views[rows])) > views:
                 kept[rows] = False
                 kept[rows][last_in_voxels(self._cloud.points_world[rows], edge, depth)] = True
                 changed.add(label)
@@ -147,7 +151,7 @@ class ObjectPoints:
             return set()
         poses = np.array([T.get(view, np.eye(4)) for view in range(int(self._views.max()) + 1)])
         changed = set(np.unique(self._labels[moving]).tolist())
-        self._transform(poses, self._views, changed)
+        self._transform(poses, self._views.astype(np.intp), changed)
         return changed
 
     def merge(self, old: int, new: int) -> None:
@@ -288,7 +292,7 @@ class ObjectModels:
             kept = np.flatnonzero(segments)
             kept = kept[thin(points[kept], self._config.explanation.spacing)]
             self._segments.append((cKDTree(points[kept]), labels[kept]))
-            if len(self._segments) > 2 * self._config.cloud.depth:  # as far back as points are kept
+            if len(self._segments) > self._config.cloud.views:
                 del self._segments[0]
                 self._owners = {k: (cloud, rows[1:]) for k, (cloud, rows) in self._owners.items()}
         named = associate(
@@ -352,7 +356,8 @@ class ObjectModels:
         voxels[SUPPORT_LABEL:] = config.surface.spacing
         kept = most_central(observation.cloud.points_world, observation.labels, voxels)
         self.points.add(observation.cloud.select(kept), observation.labels[kept], view)
-        self.points.bound({label: float(voxels[label]) for label in shown}, config.cloud.depth)
+        edges = {label: float(voxels[label]) for label in shown}
+        self.points.bound(edges, config.cloud.views, config.cloud.depth)
         return shown - {SUPPORT_LABEL}
 
     def fit_newest(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
