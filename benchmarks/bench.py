@@ -105,9 +105,9 @@ def write_docs(rows: Sequence[Row], folder: Path) -> None:
 def compare(rows_by_name: Mapping[str, Sequence[Row]], part: bool, console: Console) -> int:
     """Compare the ratios with the baseline, and return the exit status.
 
-    A measurement with a worse ratio is repeated, and so is that of the machine's speed, and the better figure
-    counts: noise slows a run more often than it speeds one up. Ratios that lack a peer are reported; the gate
-    fails only if no ratio was measured.
+    A worse ratio is measured again, with the machine's speed, and the better figure counts: noise slows a run
+    more often than it speeds one up. Ratios that lack a peer are reported; the gate fails only if no ratio
+    was measured.
     """
     known = read_baseline(BASELINE)
     found = {m.name: m for rows in rows_by_name.values() for m in measures(rows)}

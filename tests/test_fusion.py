@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -204,6 +206,21 @@ def test_edges_of_an_object_taken_for_another_count_for_the_other():
     fused = fused_graph(tuple(renamed(view, {"o3": "o1"}) for view in views), BOTH)
     assert {o.id: (o.label, o.occurrences) for o in fused.objects[1:]} == {"o1": (1, 2), "o2": (2, 2)}
     assert {s.pair: s.occurrences for s in fused.supports} == {("o1", "o2"): 2, ("o0", "o1"): 1}
+
+
+@pytest.mark.parametrize("config", [PC, BOTH], ids=lambda c: c.method)
+def test_earlier_graphs_share_what_the_later_ones_replace(config):
+    sizes = [
+        len(pickle.dumps(together(*[copy.deepcopy(FULL) for _ in range(n)], config=config))) for n in (5, 25)
+    ]
+    assert sizes[1] - sizes[0] < 20 * len(pickle.dumps(FULL)) / 4
+
+
+def test_a_support_that_only_earlier_graphs_have_keeps_its_reason():
+    held = together(FULL, FULL, FULL, config=BOTH)
+    # A report of the robot replaces the newest graph.
+    fused = fused_graph((*held[:-1], graph(("o0", "o1"))), BOTH)
+    assert [s.why for s in fused.supports if s.pair == ("o1", "o2")] == ["o1>o2"]
 
 
 def test_a_support_that_a_view_lacks_is_doubtful():

@@ -75,7 +75,7 @@ class CloudConfig:
     voxel: Positive = 0.005
     """Spacing of an object's points, pooled over views [m]; about the noise of one reading at 1.5 m."""
     views: Count = 10
-    """Number of views whose segments and points are all kept [1]."""
+    """Number of views whose points and segments are all kept [1]."""
     depth: Count = 3
     """Points kept per voxel of an object that more views show [1]; a fit uses the one nearest their mean."""
     neighbours: Count = 16

@@ -47,16 +47,17 @@ def fuse(
         if o.id not in names:
             names[o.id] = _fresh_id(o, taken)
             taken.add(names[o.id])
-    graph = renamed(graph, names)
-    return (*(graphs if config.method == "sg" else _superseded(graphs, graph)), graph), names
+    if config.method != "sg" and graphs:  # The last one stays whole: a report may replace the one added here.
+        graphs = (*_superseded(graphs[:-1], graphs[-1]), graphs[-1])
+    return (*graphs, renamed(graph, names)), names
 
 
-def _superseded(graphs: Graphs, newest: SupportGraph) -> Graphs:
-    """Keep of earlier graphs only what counts beside the newest one: ids, and probabilities of supports.
+def _superseded(graphs: Graphs, newer: SupportGraph) -> Graphs:
+    """Keep of graphs only what counts beside a newer one: ids, and probabilities of supports.
 
-    Without this, the memory of a long session would grow with its number of views.
+    Without this, the memory of a session would grow with every view.
     """
-    objects, pairs = {o.id: o for o in newest.objects}, {s.pair for s in newest.supports}
+    objects, pairs = {o.id: o for o in newer.objects}, {s.pair for s in newer.supports}
     return tuple(
         SupportGraph(
             tuple(objects.get(o.id, o) for o in g.objects),
