@@ -81,7 +81,7 @@ def normal_equations(kind, shape, points, scale, H, g):  # type: ignore[no-untyp
         for b in range(9):
             H[a, b] = 0.0
     R, centre, share = shape[:3], shape[3], 1.0 / len(points)
-    hx, hy, hz = shape[4]
+    hx, hy, hz = shape[4, 0], shape[4, 1], shape[4, 2]
     for i in range(len(points)):
         x, y, z = local(R, centre, points, i)
         d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
@@ -125,7 +125,7 @@ def _stepped(kind, shape, step, columns, min_extent, trial):  # type: ignore[no-
     sine = np.sin(angle) / angle if angle >= 1e-12 else 1.0
     rest = (1.0 - np.cos(angle)) / (angle * angle) if angle >= 1e-12 else 0.0
     for i in range(3):
-        u, v, w = shape[i]
+        u, v, w = shape[i, 0], shape[i, 1], shape[i, 2]
         moved[i] += (u * step[0] + v * step[1] + w * step[2]) / longest
         along = rest * (u * x + v * y + w * z)
         cosine = np.cos(angle) if angle >= 1e-12 else 1.0

@@ -197,13 +197,15 @@ def _ranked(
         drawn = rng.choice(len(points), count, replace=False)
         points, normals = points[drawn], normals[drawn]
     origin = points.mean(axis=0)
+    centred = points - origin
+    some, facing = centred[::every].copy(), normals[::every].copy()
     kinds = [KINDS[kind] for kind in config.shapes]
     samples = rng.integers(0, -(-count // every), size=(len(kinds), config.hypotheses, 2))
     rows = len(kinds), config.polish + 2
     shapes, score = np.empty((*rows, 5, 3)), np.full((*rows, 3), np.inf)
     seen = np.empty((*rows, 6), dtype=np.bool_)
     best = _best_of_each(
-        np.array([kind.code for kind in kinds]), points - origin, normals, every, samples, config.steps,
+        np.array([kind.code for kind in kinds]), centred, normals, some, facing, samples, config.steps,
         config.threshold, config.max_radius, config.max_extent, config.min_extent, config.normal_weight,
         config.min_points, shapes, score, seen,
     )  # fmt: skip
@@ -219,16 +221,17 @@ def _ranked(
 
 @kernel
 def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
-    kinds, points, normals, every, samples, steps, threshold, max_radius, max_extent, min_extent,
+    kinds, points, normals, some, facing, samples, steps, threshold, max_radius, max_extent, min_extent,
     normal_weight, min_points, shapes, score, seen,
 ):  # fmt: skip
-    """Fit each kind of shape: search among every n-th point, least squares, score by all points.
+    """Fit each kind of shape: search among some points, least squares, score by all points.
 
     Args:
         kinds: Codes (K,).
         points: (N, 3) [m], about the origin.
         normals: Unit normals (N, 3).
-        every: Every n-th point is searched.
+        some: The points (M, 3) among which shapes are searched.
+        facing: Their normals (M, 3).
         samples: Pairs (K, B, 2) of those points that hypotheses are made from; then settings as configured.
         shapes: S of each kind (K, S, 5, 3); written to, and so are the rest. All but two of them are
             hypotheses from the search, one is of a single face, one the last refinement of the best.
@@ -238,14 +241,15 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
     Returns:
         Which of its shapes is the best of each kind (K,); −1 = none.
     """
-    some, facing, polish = points[::every].copy(), normals[::every].copy(), shapes.shape[1] - 2
+    polish = shapes.shape[1] - 2
     best, found = np.zeros(len(kinds), np.intp), np.zeros(len(kinds), np.intp)
     within = np.zeros(len(kinds), np.bool_)
     least_seen = max(min_points / 3.0, 0.02 * len(points))  # Points that confirm a side.
     for turn in range(4):
         least = np.inf
         for k in range(len(kinds)):
-            x, y, z = shapes[k, best[k], 4]
+            row = best[k]
+            x, y, z = shapes[k, row, 4, 0], shapes[k, row, 4, 1], shapes[k, row, 4, 2]
             within[k] = score[k, best[k], 0] < np.inf and 2.0 * max(x, y, z) <= max_extent
             if within[k]:
                 least = min(least, score[k, best[k], 0])
@@ -275,7 +279,7 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
                 residual, turned, inliers = _judge(
                     kinds[k], shape, points, normals, threshold, least_seen, min_extent, seen[k, row]
                 )
-                x, y, z = shape[4]
+                x, y, z = shape[4, 0], shape[4, 1], shape[4, 2]
                 # Of the mean squared extent a dm² costs 0.125 mm.
                 size = 4.0 * (x * x + y * y + z * z) / 3.0
                 cost = residual + normal_weight * turned + 0.0125 * size
@@ -300,7 +304,7 @@ def _judge(kind, shape, points, normals, threshold, least, min_extent, seen):  #
     """
     own, facing = in_frame(shape[:3], shape[3], points), in_frame(shape[:3], np.zeros(3), normals)
     counts, near, count = np.zeros(6), np.empty((len(points), 3)), 0
-    hx, hy, hz = shape[4]
+    hx, hy, hz = shape[4, 0], shape[4, 1], shape[4, 2]
     for i in range(len(points)):
         d, gx, gy, gz = gradient(kind, own[i, 0], own[i, 1], own[i, 2], hx, hy, hz)
         if not abs(d) < threshold:
@@ -318,7 +322,7 @@ def _judge(kind, shape, points, normals, threshold, least, min_extent, seen):  #
     away = turned = 0.0
     inliers = 0
     count = len(points)
-    hx, hy, hz = shape[4]
+    hx, hy, hz = shape[4, 0], shape[4, 1], shape[4, 2]
     for i in range(count):
         d, gx, gy, gz = gradient(kind, own[i, 0], own[i, 1], own[i, 2], hx, hy, hz)
         away += min(abs(d), threshold)

@@ -31,7 +31,7 @@ def search(  # type: ignore[no-untyped-def]
     count, cost = len(points), np.full(keep + 1, np.inf)
     most_inliers = found = 0
     for b in range(len(samples)):
-        i, j = samples[b]
+        i, j = samples[b, 0], samples[b, 1]
         if _hypothesis(kind, points, normals, i, j, max_radius, max_extent, shapes[keep]):
             limit = cost[keep - 1] * count
             total, inliers = _msac(kind, shapes[keep], points, threshold, limit)
@@ -95,7 +95,7 @@ def _of_one_face(kind, points, normals, min_extent, max_radius, max_extent, shap
             count += 1
     high[2] = quantile(heights[:count], 0.5)
     low[2] = min(low[2], high[2] - min_extent)
-    centre[:] = 0.0
+    centre[0] = centre[1] = centre[2] = 0.0
     for a in range(3):
         half[a] = (high[a] - low[a]) / 2.0
         for b in range(3):
@@ -144,7 +144,7 @@ def _hypothesis(kind, points, normals, i, j, max_radius, max_extent, shape):  # 
         if sine <= 0.5:
             return False
         _set_axes(R, ux / sine, uy / sine, uz / sine, ax, ay, az, 1)
-        centre[:] = 0.0
+        centre[0] = centre[1] = centre[2] = 0.0
         for a in range(3):
             low, high = _range(points, R[0, a], R[1, a], R[2, a])
             half[a] = max(high - low, LEAST_EXTENT) / 2.0
@@ -166,7 +166,7 @@ def _hypothesis(kind, points, normals, i, j, max_radius, max_extent, shape):  # 
     cx = (points[i, 0] + points[j, 0] - radius * (ax + bx)) / 2.0
     cy = (points[i, 1] + points[j, 1] - radius * (ay + by)) / 2.0
     cz = (points[i, 2] + points[j, 2] - radius * (az + bz)) / 2.0
-    half[:] = radius
+    half[0] = half[1] = half[2] = radius
     level = 0.0
     if kind == CYLINDER:
         low, high = _range(points, x, y, z)

@@ -27,6 +27,9 @@ _CYLINDER_RIMS = np.array(
     [(math.cos(a), math.sin(a), end) for end in (1.0, -1.0) for a in 2.0 * np.pi * np.arange(24) / 24]
 )
 """Points (48, 3) of a cylinder's rims, in radii and half heights."""
+_ANGLES = 2.0 * np.pi * np.arange(64) / 64
+_RING = np.stack([-np.sin(_ANGLES), np.cos(_ANGLES)], axis=-1)
+"""Points (64, 2) of a ball's outline from above, in radii."""
 _BOX_EDGES = np.array([(i, i + bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
 _CYLINDER_EDGES = np.concatenate(
     [[(i, i + 24), (i, (i + 1) % 24), (i + 24, (i + 1) % 24 + 24)] for i in range(24)]
@@ -394,9 +397,7 @@ class Sphere(Shape):
 
     def footprint(self) -> Array:
         """Outline (64, 2) [m] of the ball projected to the ground."""
-        angle = 2.0 * np.pi * np.arange(64) / 64
-        ring = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
-        return polygons.hull(self.T_world_object[:2, 3] + self.radius * ring)
+        return polygons.hull(self.T_world_object[:2, 3] + self.radius * _RING)
 
     def cap(self, direction_world: Array, depth: float) -> Array:
         """Rim (64, 2) [m] on the ground of the part within `depth` [m] of its end in a direction (3,).

@@ -96,6 +96,16 @@ def gradient(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
     return qz, 0.0, 0.0, np.sign(z)
 
 
+@inner
+def inside(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
+    """Whether a point in the object's frame is inside the shape."""
+    if kind == SPHERE:
+        return x * x + y * y + z * z < hx * hx
+    if kind == CYLINDER:
+        return x * x + y * y < hx * hx and abs(z) < hz
+    return abs(x) < hx and abs(y) < hy and abs(z) < hz
+
+
 @kernel
 def sample_surface(kind, R, centre, half, spacing):  # type: ignore[no-untyped-def]
     """Points (N, 3) [m] about `spacing` metres apart all over a surface, and outward normals (N, 3)."""
@@ -113,10 +123,10 @@ def sample_surface(kind, R, centre, half, spacing):  # type: ignore[no-untyped-d
         for face in range(6):
             count = _face(kind, points, normals, count, half, face, spacing)
     for n in range(count):
-        x, y, z = points[n]
-        u, v, w = normals[n]
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        u, v, w = normals[n, 0], normals[n, 1], normals[n, 2]
         for axis in range(3):
-            a, b, c = R[axis]
+            a, b, c = R[axis, 0], R[axis, 1], R[axis, 2]
             points[n, axis] = a * x + b * y + c * z + centre[axis]
             normals[n, axis] = a * u + b * v + c * w
     return points[:count], normals[:count]

@@ -296,7 +296,7 @@ def _distances(points, faces, ends):  # type: ignore[no-untyped-def]
     """Distances (N,) [m] of points (N, 3) to the nearest of several parts, by the planes (F, 4) of each."""
     found = np.empty(len(points))
     for i in range(len(points)):
-        x, y, z = points[i]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
         least, start = np.inf, 0
         for end in ends:
             most = -np.inf

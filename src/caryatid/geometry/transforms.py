@@ -143,9 +143,12 @@ def look_at(eye_world: ArrayLike, target_world: ArrayLike, up_world: ArrayLike =
     if (np.linalg.norm(forward, axis=-1) < 1e-9).any():
         raise InputError("look_at", "eye and target are the same point", "give two different points")
     z = unit(forward)
-    x = np.cross(z, np.asarray(up_world, dtype=np.float64))
-    aside = np.where(np.abs(z[..., :1]) > 0.9, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
-    x = unit(np.where(np.linalg.norm(x, axis=-1, keepdims=True) < 1e-6, np.cross(z, aside), x))
+    x = z @ skew(np.asarray(up_world, dtype=np.float64))  # z × up
+    upright = np.linalg.norm(x, axis=-1) < 1e-6
+    if upright.any():
+        aside = np.where(np.abs(z[upright, :1]) > 0.9, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
+        x[upright] = np.cross(z[upright], aside)
+    x = unit(x)
     T = np.zeros((*z.shape[:-1], 4, 4))
     T[..., :3, :] = np.stack([x, np.cross(z, x), z, np.broadcast_to(eye, z.shape)], axis=-1)
     T[..., 3, 3] = 1.0

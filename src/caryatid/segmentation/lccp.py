@@ -57,7 +57,7 @@ def _find_pairs(number, points, normals, planes, ways, edge_jump):  # type: igno
         if i < 0:
             continue
         for k in range(len(ways)):
-            down, right = ways[k]
+            down, right = ways[k, 0], ways[k, 1]
             if row + down >= height or col + right < 0 or col + right >= width:
                 continue
             j = number[row + down, col + right]
@@ -160,7 +160,7 @@ def _spread_seeds(points, normals, edges, start, seeds, surfel, crease):  # type
     neighbour, length = np.empty(2 * len(edges), dtype=np.intp), np.empty(2 * len(edges))
     free, apart = start[:-1].copy(), np.empty(len(edges))
     for e in range(len(edges)):
-        i, j = edges[e]
+        i, j = edges[e, 0], edges[e, 1]
         square, cosine = 0.0, 0.0
         for axis in range(3):
             square += (points[i, axis] - points[j, axis]) ** 2

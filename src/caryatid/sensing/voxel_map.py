@@ -21,7 +21,7 @@ from caryatid.config import VoxelConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import Primitives, Shape
-from caryatid.geometry.signed_distance import gradient, local
+from caryatid.geometry.signed_distance import inside, local
 from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, for_each, inner, kernel
@@ -149,11 +149,11 @@ class VoxelMap:
         low, high = ((corner - self.origin_world) / size for corner in arrays.bounds())
         low = np.clip(np.floor(low).astype(np.int64), 0, self.hits.shape)
         high = np.clip(np.ceil(high).astype(np.int64), 0, self.hits.shape)
-        some, index = (low < high).all(axis=1), self.occupied
-        lowest = np.concatenate([low[some].T, index], axis=1).min(axis=1, initial=max(self.hits.shape))
-        highest = np.concatenate([high[some].T, index + 1], axis=1).max(axis=1, initial=0)
-        grid = np.zeros(np.maximum(highest - lowest, 0), dtype=np.uint8)
-        grid[tuple(index - lowest[:, None])] = 1
+        some, index, most = (low < high).all(axis=1), self.occupied, max(self.hits.shape)
+        lowest = np.minimum(low[some].min(axis=0, initial=most), index.min(axis=1, initial=most))
+        highest = np.maximum(high[some].max(axis=0, initial=0), index.max(axis=1, initial=-1) + 1)
+        window = tuple(slice(a, b) for a, b in zip(lowest, highest, strict=True))
+        grid = (self.states[window] == OCCUPIED).view(np.uint8)
         origin_world = self.origin_world + size * lowest
         low, high = low - lowest, high - lowest
         for number, shape in enumerate(shapes):
@@ -281,10 +281,11 @@ def _indices(low: NDArray[np.intp], high: NDArray[np.intp]) -> NDArray[np.intp]:
 
 def _values_at(grid: NDArray[np.int8], points: Array, origin: Array, size: float) -> NDArray[np.int8]:
     """Values (N,) that the voxels of a grid (X, Y, Z) hold at points (N, 3) [m]; 0 outside."""
-    index = np.floor((points - origin).T / size).astype(np.intp)
-    inside = ((index >= 0) & (index < np.reshape(grid.shape, (3, 1)))).all(axis=0)
+    i, j, k = np.floor((points - origin).T / size).astype(np.intp)
+    x, y, z = grid.shape
+    inside = (i >= 0) & (i < x) & (j >= 0) & (j < y) & (k >= 0) & (k < z)
     values = np.zeros(len(points), dtype=np.int8)
-    values[inside] = grid[tuple(index[:, inside])]
+    values[inside] = grid.reshape(-1)[((i * y + j) * z + k)[inside]]
     return values
 
 
@@ -369,7 +370,7 @@ def _fill(share, data):  # type: ignore[no-untyped-def]
                 for k in range(low[s, 2], high[s, 2]):
                     centre[0, 2] = origin[2] + (k + 0.5) * size
                     x, y, z = local(R[s], centres[s], centre, 0)
-                    if gradient(kinds[s], x, y, z, half[s, 0], half[s, 1], half[s, 2])[0] < 0.0:
+                    if inside(kinds[s], x, y, z, half[s, 0], half[s, 1], half[s, 2]):
                         grid[i, j, k] = 1
 
 
@@ -423,10 +424,8 @@ def _hide(data, found, p, first, end):  # type: ignore[no-untyped-def]
             continue
         ray = (dx * per_metre, dy * per_metre, dz * per_metre)
         slabs = traverse(found, shape, start, ray, clearance / length, 1.0)
-        blocked = np.uint8(0)
         for m in range(slabs):
-            blocked |= flat[np.uint32(found[0, m])]
-            blocked |= flat[np.uint32(found[1, m])]
-            blocked |= flat[np.uint32(found[2, m])]
-        if blocked:
-            worth[n] = 0.0
+            blocked = flat[np.uint32(found[0, m])] | flat[np.uint32(found[1, m])]
+            if blocked | flat[np.uint32(found[2, m])]:
+                worth[n] = 0.0
+                break
