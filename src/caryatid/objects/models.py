@@ -175,7 +175,9 @@ class ObjectPoints:
         return names
 
     def _rows(self, label: int) -> slice:
-        return slice(*(int(np.searchsorted(self._labels, label, side)) for side in ("left", "right")))
+        # With a label of another type, NumPy would convert all labels.
+        own = np.int32(label)
+        return slice(*(int(np.searchsorted(self._labels, own, side)) for side in ("left", "right")))
 
     def _transform(self, poses: Array, which: NDArray[np.intp], changed: set[int]) -> None:
         """Move each point by one (N,) of some poses (K, 4, 4); forget what was selected of some labels."""
@@ -686,9 +688,14 @@ class _KnownObjects:
         near = ((self._low <= own.max(axis=0)) & (self._high >= own.min(axis=0))).all(axis=2)
         if among is not None:
             near[np.setdiff1d(np.arange(len(near)), among)] = False
+        # Points in the order of x: those within an object's bounds along it lie side by side.
+        order = np.argsort(own[:, 0])
+        starts = np.searchsorted(own[order, 0], self._low[..., 0], "right")
+        ends = np.searchsorted(own[order, 0], self._high[..., 0], "left")
         for number, by in np.argwhere(near).tolist():
-            within = ((own > self._low[number, by]) & (own < self._high[number, by])).all(axis=1)
-            rows = np.flatnonzero(within)
+            rows = order[starts[number, by] : ends[number, by]]
+            within = (own[rows] > self._low[number, by]) & (own[rows] < self._high[number, by])
+            rows = rows[within.all(axis=1)]
             rows = rows[~self.unlike([number], index[rows])]
             if not len(rows):
                 continue
