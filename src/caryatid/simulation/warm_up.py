@@ -9,7 +9,7 @@ import numpy as np
 from caryatid.config import Config, FitConfig, SegmentationMethod, SensorConfig, VoxelConfig
 from caryatid.exploration import Step, explore, next_best_view
 from caryatid.fitting.primitives import fit
-from caryatid.geometry.shapes import Box
+from caryatid.geometry.shapes import Box, Primitives
 from caryatid.geometry.solids import Solid
 from caryatid.planning.planners import BUILT_IN
 from caryatid.scene import Scene
@@ -30,17 +30,19 @@ def warm_up(number: int) -> None:
 
 
 def _explore_without_fits() -> None:
-    _explore_by_colour_and_depth(min_points=1_000_000)
+    _explore("auto", min_points=1_000_000)
 
 
 def _fit() -> None:
-    points, normals = Box(np.eye(4), np.array([0.1, 0.2, 0.1])).surface(0.01)
+    box = Box(np.eye(4), np.array([0.1, 0.2, 0.1]))
+    points, normals = box.surface(0.01)
+    Primitives.of([box]).gradient(0, points)
     fit(points, normals, config=Config().fit, rng=np.random.default_rng(0))
     Solid.from_extents(np.eye(4), np.ones(3)).signed_distance(points)
 
 
-def _explore_by_colour_and_depth(min_points: int = 12) -> None:
-    config, simulation, _ = _explore("auto", min_points)
+def _explore_by_colour_and_depth() -> None:
+    config, simulation, _ = _explore("auto")
     scene = Scene(config, segmentation="auto")
     scene.update(simulation.camera.capture(simulation.robot.T_world_camera))
     for planner in BUILT_IN:
