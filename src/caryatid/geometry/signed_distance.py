@@ -97,8 +97,8 @@ def gradient(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
 
 
 @inner
-def inside(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
-    """Whether a point in the object's frame is inside the shape."""
+def contains(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
+    """Whether the shape contains a point in the object's frame."""
     if kind == SPHERE:
         return x * x + y * y + z * z < hx * hx
     if kind == CYLINDER:

@@ -21,7 +21,7 @@ from caryatid.config import VoxelConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import Primitives, Shape
-from caryatid.geometry.signed_distance import inside, local
+from caryatid.geometry.signed_distance import contains, local
 from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, for_each, inner, kernel
@@ -370,7 +370,7 @@ def _fill(share, data):  # type: ignore[no-untyped-def]
                 for k in range(low[s, 2], high[s, 2]):
                     centre[0, 2] = origin[2] + (k + 0.5) * size
                     x, y, z = local(R[s], centres[s], centre, 0)
-                    if inside(kinds[s], x, y, z, half[s, 0], half[s, 1], half[s, 2]):
+                    if contains(kinds[s], x, y, z, half[s, 0], half[s, 1], half[s, 2]):
                         grid[i, j, k] = 1
 
 
