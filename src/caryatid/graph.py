@@ -21,7 +21,7 @@ ChangeKind = Literal["removed", "moved", "added"]
 LIKELY = 0.5
 """Minimum probability of a support in a graph [1]."""
 DOUBTFUL = 0.9
-"""Probability below which a support is doubtful [1]."""
+"""Probability up to which a support is doubtful [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -109,8 +109,8 @@ class Support:
 
     @property
     def doubtful(self) -> bool:
-        """Whether its `belief` is below `DOUBTFUL`."""
-        return self.belief < DOUBTFUL
+        """Whether its `belief` is at most `DOUBTFUL`."""
+        return self.belief <= DOUBTFUL
 
     def __repr__(self) -> str:
         found = f"found in {self.occurrences} of {self.opportunities}"

@@ -536,6 +536,7 @@ class Scene(Pictured):
         named: bool,
     ) -> Observation:
         """Fit the objects this view changed; split and merge automatic segments as the shapes suggest."""
+        voxels = voxels.closed_below(surface.outline_world, surface.normal_world)
         if self.config.fusion.method == "sg":
             self._models.fit_newest(set(observation.shown) - {0, SUPPORT_LABEL}, voxels)
             return observation

@@ -234,7 +234,7 @@ def _sums(forecasts: Sequence[Sequence[float]]) -> Array:
     said, true = table[table[:, 0] > 0.0].T
     bins = np.minimum(BINS * said, BINS - 1).astype(int)
     binned = [np.bincount(bins, of, BINS) for of in (np.ones(len(bins)), said, true)]
-    simple = np.where(said < DOUBTFUL, 0.5, 1.0)
+    simple = np.where(said <= DOUBTFUL, 0.5, 1.0)
     squares = ((said - true) ** 2).sum(), ((simple - true) ** 2).sum()
     return np.concatenate([[len(table) - len(said), *squares], *binned])
 

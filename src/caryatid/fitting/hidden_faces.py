@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import shapely
 
 from caryatid.config import FitConfig
 from caryatid.fitting.least_squares import CONVERGED, NOISE_FLOOR, levenberg_marquardt, normal_equations
@@ -49,6 +50,8 @@ def close_hidden_faces(
     low, high = 0.05 * hidden.T
     refined = np.concatenate([axes, [kept[0] + axes @ ((high - low) / 2.0), kept[1] + (low + high) / 2.0]])
     levenberg_marquardt(kind, refined, points, config.steps, config.min_extent, 0.0, CONVERGED)
+    if kind == BOX and sum(seen) == 1:
+        _square_up(refined, int(np.flatnonzero(seen)[0]) // 2, points)
     R, middle, half = refined[:3], refined[3].copy(), refined[4]
     distance = np.abs(signed_distances(kind, R, middle, half, points))
     near = distance[distance < config.threshold]
@@ -79,6 +82,22 @@ def close_hidden_faces(
     residual = float(np.minimum(distance, config.threshold).mean())
     inliers = np.count_nonzero(distance < config.threshold) / len(points)
     return found, residual, inliers, deviations(kind, unsure, information, config)
+
+
+def _square_up(shape: Array, axis: int, points: Array) -> None:
+    """Turn a box (5, 3) about an axis, 0 to 2, to the smallest rectangle around its points (N, 3).
+
+    A single face leaves that turn to the noise of its rim in least squares.
+    """
+    u, v = (axis + 1) % 3, (axis + 2) % 3
+    places = (points @ shape[:3])[:, [u, v]]
+    rectangle = shapely.get_coordinates(shapely.oriented_envelope(shapely.MultiPoint(places)))
+    along = rectangle[1] - rectangle[0]  # Of points on a line, the line.
+    turn = np.arctan2(along[1], along[0])
+    turn -= np.round(turn / (np.pi / 2.0)) * (np.pi / 2.0)
+    c, s = np.cos(turn), np.sin(turn)
+    first, second = shape[:3, u].copy(), shape[:3, v].copy()
+    shape[:3, u], shape[:3, v] = c * first + s * second, c * second - s * first
 
 
 def deviations(kind: int, unsure: Array, information: Array, config: FitConfig) -> Uncertainty:

@@ -22,7 +22,7 @@ from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 FREE_WEIGHT = 0.01
 """Cost of a shape whose whole inside was seen free [m]; in proportion for a share of it."""
-BARE_SPACING = 0.008
+BARE_SPACING = 0.005
 """Spacing of the samples on a side that count points near it [m]; a point within twice that is near one."""
 
 
@@ -254,17 +254,17 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
             if within[k]:
                 least = min(least, score[k, best[k], 0])
         for k in range(len(kinds)):
-            first, last, used = 0, 0, some
+            first, last, step, used = 0, 0, 1, some
             if turn == 0:
                 found[k] = search(
                     kinds[k], some, facing, samples[k], polish, threshold, max_radius, max_extent, min_extent,
                     shapes[k],
                 )  # fmt: skip
-                last = min(found[k], 1)
+                last, step = found[k], max(found[k] - 1, 1)
             elif turn == 1 and not (within[k] and score[k, best[k], 0] > 4.0 * least):
-                # The first start of each kind tells which kinds' other starts are worth refining: those may
-                # halve what it found, and twice the best may still win.
-                first, last = 1, found[k]
+                # The first and the last start of each kind, of a single face, tell which kinds' others are
+                # worth refining: those may halve what they found, and twice the best may still win.
+                first, last = 1, found[k] - 1
             elif turn == 2 and within[k] and score[k, best[k], 0] <= 2.0 * least:
                 # Kinds are compared when least squares on all the points gain nothing more. By now
                 # they gain a thousandth a step, so kinds that cost twice as much as the best cannot catch up.
@@ -273,7 +273,7 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
             elif turn == 3 and not within[k]:
                 best[k] = -1
             # A small pull on the extents keeps sides without points near; the last fit has none.
-            for row in range(first, last):
+            for row in range(first, last, step):
                 shape, converged = shapes[k, row], CONVERGED if turn == 2 else 10.0 * CONVERGED
                 levenberg_marquardt(kinds[k], shape, used, steps, min_extent, 2e-5, converged)
                 residual, turned, inliers = _judge(

@@ -442,6 +442,14 @@ class Uncertainty:
     sizes: Array
     sides: Array
 
+    def widened(self, side: int, variance: float) -> Uncertainty:
+        """Add a variance [m²] to the position of one side, 0 to 5, of six independent ones."""
+        position, sizes, sides = self.position**2, self.sizes**2, self.sides**2
+        position[side // 2] += variance / 4.0
+        sizes[side // 2] += variance
+        sides[side] += variance
+        return Uncertainty(np.sqrt(position), self.rotation, np.sqrt(sizes), np.sqrt(sides))
+
 
 class Primitives(NamedTuple):
     """N shapes in the world frame, for the compiled kernels.

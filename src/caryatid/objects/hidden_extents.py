@@ -32,7 +32,8 @@ def complete(
     """Extend the unseen lower side of each object until it meets free space, another shape or the table.
 
     An object with a single seen side is taken to be as deep as it is wide, within the same bounds. Objects
-    are extended from the lowest up, so that those below each one are complete.
+    are extended from the lowest up, so that those below each one are complete. Then unseen upper sides, whose
+    points end only in the shadow of what lies above, are extended to it where that is likelier than not.
 
     Args:
         objects: Objects without the support surface; `seen` says which sides points confirm.
@@ -45,7 +46,50 @@ def complete(
     for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
         others = [o.shape for n, o in enumerate(done) if n != k]
         done[k] = _extended(done[k], others, surface, voxels, config)
+    lower = [o.shape for o in done]
+    for k, o in enumerate(done):
+        done[k] = _raised(o, lower[:k] + lower[k + 1 :], voxels, config)
     return done
+
+
+def _raised(
+    candidate: SceneObject, others: Sequence[Shape], voxels: VoxelMap, config: CompletionConfig
+) -> SceneObject:
+    """Extend an object's unseen upper side to the shape above if that is likely; widen its uncertainty."""
+    shape, known = candidate.shape, candidate.uncertainty
+    if isinstance(shape, Sphere) or known is None:
+        return candidate
+    axis, sign = _downward_side(shape)
+    side = 2 * axis + (sign < 0.0)
+    up_world = -sign * shape.T_world_object[:3, axis]
+    if candidate.seen[side] or up_world[2] < np.cos(np.radians(config.max_tilt)):
+        return candidate
+    points, rim = _face(shape, axis, -sign)
+    across = np.delete(shape.T_world_object[:3, :3], axis, axis=1)
+    shown, most = float(shape.extents[axis]), float(voxels.config.extent[2])
+    room = _way_to_others(_inwards(points, across, config.overlap), up_world, most, others, config)
+    if room < LEAST or room >= most:
+        return candidate
+    if _free_before(_inwards(rim, across, voxels.config.size), up_world, room, voxels, config) < room:
+        return candidate
+    if shown >= room:
+        why = f"an unseen upper side is assumed to reach the next object, {1000 * room:.0f} mm further"
+        why = f"{candidate.why}; {why}" if candidate.why else why
+        shape = _lengthened(shape, axis, -sign, room)
+        candidate = replace(candidate, shape=shape, why=why)
+    variance = _variance(shown, room, room if shown >= room else 0.0)
+    return replace(candidate, uncertainty=known.widened(side, variance))
+
+
+def _variance(shown: float, room: float, put: float) -> float:
+    """Mean squared error [m²] of a side put that far beyond the part of an object that shows [m].
+
+    Of a length l, the share v/l that shows is anything between 0 and 1, and without a scale, p(l) ∝ 1/l. So
+    l has the density v/l², and it exceeds w = v + room with probability v/w; then the side ends there.
+    """
+    v, w, at = shown, shown + room, shown + put
+    # ∫ v/l² (l − at)² dl from v to w, and the rest at w.
+    return float(v * (w - v) - 2.0 * v * at * np.log(w / v) + at**2 * (w - v) / w + (w - at) ** 2 * v / w)
 
 
 def _extended(

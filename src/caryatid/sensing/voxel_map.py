@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from caryatid.config import VoxelConfig
@@ -113,6 +114,23 @@ class VoxelMap:
         """Return the map with some of its voxels (X, Y, Z) unseen."""
         hits, passes = (np.where(which, np.uint8(0), counts) for counts in (self.hits, self.passes))
         return VoxelMap(self.origin_world, hits, passes, self.config)
+
+    def closed_below(self, outline_world: Array, normal_world: Array) -> VoxelMap:
+        """Return the map with the space below a level surface free: no object is there.
+
+        Args:
+            outline_world: Corners (M, 3) [m] of the convex surface, counter-clockwise seen from above.
+            normal_world: Its unit normal (3,), upwards.
+        """
+        x, y, z = (origin + self.config.size * (np.arange(count) + 0.5)
+                   for origin, count in zip(self.origin_world, self.hits.shape, strict=True))  # fmt: skip
+        inside = shapely.contains_xy(shapely.Polygon(outline_world[:, :2]), x[:, None], y)
+        middle = outline_world.mean(axis=0)
+        across = (x[:, None] - middle[0]) * normal_world[0] + (y - middle[1]) * normal_world[1]
+        heights = across[..., None] + (z - middle[2]) * normal_world[2]
+        below = inside[..., None] & (heights < -self.config.size / 2.0)
+        hits = np.where(below, np.uint8(0), self.hits)
+        return VoxelMap(self.origin_world, hits, np.where(below, np.uint8(1), self.passes), self.config)
 
     def within(self, shape: Shape, points_world: Array) -> NDArray[np.bool_]:
         """Which voxels (X, Y, Z) a shape reaches into, or contain one of some points (N, 3) [m]."""

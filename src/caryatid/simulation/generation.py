@@ -1,4 +1,4 @@
-"""Random scenes: piles, heaps between screens, packed objects, household objects and blocks."""
+"""Random scenes: piles, heaps between screens, packed objects, household objects, blocks and boards."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sphere
 from caryatid.geometry.solids import Polytope, Solid, hollowed
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.transforms import UP, Array
 from caryatid.simulation.world import (
     TABLE_HEIGHT,
     TABLE_SIZE,
@@ -32,13 +32,14 @@ from caryatid.simulation.world import (
     true_shapes,
 )
 
-GeneratedKind = Literal["pile", "dense", "packed", "house", "blocks"]
+GeneratedKind = Literal["pile", "dense", "packed", "house", "blocks", "boards"]
 SIZES: dict[GeneratedKind, tuple[int, int]] = {
     "pile": (1, 25),
     "dense": (10, 25),
     "packed": (2, 25),
     "house": (1, 14),
     "blocks": (2, 10),
+    "boards": (4, 12),
 }
 """Kind of a scene → minimum and maximum number of objects, including the screens of a dense one."""
 GAP = 0.002
@@ -70,7 +71,8 @@ def generate(
     A `pile` has most of them on earlier ones. `dense` heaps them between tall free screens, with walls that
     block part of the robot's way around. `packed` pushes them together until they touch. All these use
     primitives. `house` has trays, bowls, mugs, plates, books and the like on and in each other. `blocks` are
-    equal boxes in a row, a wall or a pyramid, with gaps of 0 to 15 mm.
+    equal boxes in a row, a wall or a pyramid, with gaps of 0 to 15 mm. `boards` has a board, plank or tray on
+    two pillars, with loads on it and lower objects under it.
 
     Args:
         kind: Kind of scene.
@@ -94,6 +96,7 @@ def generate(
         "packed": _packed,
         "house": partial(_stacked, make=thing, margin=0.12),
         "blocks": _blocks,
+        "boards": _boards,
     }
     return _set_down(name, size, plans[kind](rng, size), physics or PhysicsConfig())
 
@@ -155,6 +158,47 @@ def _blocks(rng: np.random.Generator, size: int) -> _Plan:
         return Body(box.moved(turn)), layer > 0
 
     return _Plan(draw)
+
+
+def _boards(rng: np.random.Generator, size: int) -> _Plan:
+    """A board hides the upper ends of its pillars, and of lower objects between them, from above."""
+    turn = transforms.rigid(_yaw(rng), np.zeros(3))
+    height, length = float(rng.uniform(0.08, 0.16)), float(rng.uniform(0.3, 0.45))
+    apart = length * float(rng.uniform(0.6, 0.8))
+    thickness = float(rng.uniform(0.012, 0.03))
+    board: Shape = Box(np.eye(4), np.array([float(rng.uniform(0.1, 0.2)), length, thickness]))
+    if rng.random() < 0.3:
+        board = _hollow_box(float(rng.uniform(0.14, 0.22)), length, float(rng.uniform(0.025, 0.05)))
+    under = 2 + max(1, (size - 3) // 2)
+
+    def draw(scene: SimulatedScene | None) -> _Drop:
+        number = 0 if scene is None else len(scene.object_bodies)
+        for _ in range(TRIES + 1):
+            if number < 2:
+                shape, at = _pillar(rng, height), np.array([0.0, (number - 0.5) * apart])
+            elif number < under:
+                shape = _pillar(rng, height * float(rng.uniform(0.4, 0.9)))
+                if rng.random() < 0.3:
+                    shape = Sphere(np.eye(4), float(rng.uniform(0.022, 0.45 * height)))
+                at = rng.uniform((-0.05, -0.3 * apart), (0.05, 0.3 * apart))
+            elif number == under:
+                shape, at = board, np.array([0.0, rng.uniform(-0.02, 0.02)])
+            else:
+                shape, at = _upright(rng), rng.uniform((-0.03, -0.4 * length), (0.03, 0.4 * length))
+            solid = _let_go(shape.moved(turn), turn[:2, :2] @ at, scene)
+            top = solid.shape.T_world_object[2, 3] + solid.shape.support(UP[None])[0] - TABLE_HEIGHT
+            if not 2 <= number < under or top < 0.95 * height:
+                break
+        return solid, number > under
+
+    return _Plan(draw)
+
+
+def _pillar(rng: np.random.Generator, height: float) -> Shape:
+    """A can or a carton of this height [m], at the origin."""
+    if rng.random() < 0.5:
+        return Cylinder(np.eye(4), float(rng.uniform(0.025, 0.04)), height)
+    return Box(np.eye(4), np.array([*rng.uniform(0.045, 0.08, size=2), height]))
 
 
 def _stacked(

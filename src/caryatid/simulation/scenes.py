@@ -103,6 +103,7 @@ DESCRIPTIONS: Final[Mapping[str, str]] = {
     "packed": "objects that touch each other",
     "house": "household objects on and in each other: trays, bowls, mugs, plates, books, bottles",
     "blocks": "equal boxes in a row, a wall or a pyramid",
+    "boards": "a board, plank or tray on two pillars, over other objects",
 }
 """Descriptions of the designed scenes and of the generated kinds."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.special import ndtr
 
 from caryatid.config import SupportConfig
 from caryatid.geometry import transforms
@@ -26,6 +27,8 @@ _GRAVITY = 9.81
 """[m/s²]."""
 _SOFTNESS = 1e-3
 """Share of the load by which a contact yields [1]: undetermined forces then spread evenly."""
+SIGMAS = 3.0
+"""Standard deviations beyond which no variable is drawn [1]."""
 _SLIP = 30.0
 """How much more friction yields than pressure [1]: it carries what pressure cannot. Nothing presses
 neighbours together sideways, and side by side they settle without holding each other up. What friction
@@ -59,7 +62,8 @@ def support_forces(
 
     A supports B in a draw if it carries more than a small share of B's weight, or if it presses on B, which
     is at rest with A and moves without it. The latter is asked if B moves faster without A in the estimated
-    scene. A draw in which B does not rest, although the real one was seen at rest, counts little for B.
+    scene. A draw in which B does not rest, although the real one was seen at rest, counts little for B. Where
+    B rests in no draw, or no draw closes the gap or overlap, an unseen object may carry it instead.
 
     Args:
         objects: The support surface and the objects.
@@ -69,6 +73,7 @@ def support_forces(
     scene, count = Equilibrium(objects, config), len(objects)
     held, forces, total = np.zeros((count, count)), np.zeros((count, count, 3)), np.zeros(count)
     alike, needed = np.zeros(count), np.ones((count, count), dtype=np.bool_)
+    visible = np.where(scene.explained, 1.0, 1.0 - config.unexplained)
     for number, draw in enumerate(scene.draws(rng)):
         balance = scene.solve(draw)
         rests = balance.motion <= config.at_rest
@@ -81,7 +86,7 @@ def support_forces(
             fell[group] = presses[group] & (motion > balance.motion + config.at_rest)
         if number == 0:
             needed = fell
-        held += (carries | (fell & rests)) * trust
+        held += (carries | (fell & rests)) * trust * np.where(rests, visible, 1.0 - config.unexplained)
         forces += balance.pushes * trust[:, None]
         total += trust
         alike += draw.likeness >= 0.5
@@ -90,18 +95,38 @@ def support_forces(
 
 
 def moved_without(
-    objects: Sequence[SceneObject], index: int, config: SupportConfig, rng: np.random.Generator
+    objects: Sequence[SceneObject],
+    index: int,
+    beliefs: Array,
+    config: SupportConfig,
+    rng: np.random.Generator,
 ) -> Array:
-    """Probability (N,) that each object moves when one is removed [1]; arguments as of `support_forces`."""
-    scene, moves = Equilibrium(objects, config), np.zeros(len(objects))
-    total = np.zeros(len(objects))
+    """Probability (N,) that each object moves when one is removed [1].
+
+    Args:
+        objects: The support surface and the objects.
+        index: The one to remove.
+        beliefs: Probability (N,) with which it supports each other one, NaN if nothing else is known: what
+            the draws say less, an earlier view said; then the other one moves.
+        config: The unknowns, and when an object is at rest.
+        rng: Source of the draws.
+    """
+    scene, count = Equilibrium(objects, config), len(objects)
+    moves, held, total = np.zeros(count), np.zeros(count), np.zeros(count)
+    visible = np.where(scene.explained, 1.0, 1.0 - config.unexplained)[index]
     for draw in scene.draws(rng):
-        before, after = scene.solve(draw).motion, scene.solve(draw, without=[index]).motion
-        trust = np.where(before <= config.at_rest, 1.0, config.unexplained)
-        moves += (after > before + config.at_rest) * trust
+        balance, after = scene.solve(draw), scene.solve(draw, without=[index]).motion
+        rests = balance.motion <= config.at_rest
+        trust = np.where(rests, 1.0, config.unexplained)
+        sure = trust * np.where(rests, 1.0, 1.0 - config.unexplained)
+        fell = after > balance.motion + config.at_rest
+        moves += fell * sure
+        held += ((balance.pushes[index, :, 2] > config.force_share) | fell) * sure
         total += trust
+    held, moves = held / total * visible, moves / total
+    moves = np.fmax(moves, moves + (1.0 - moves) * (beliefs - held))
     moves[index] = 0.0
-    probability: Array = (moves / total).clip(0.0, 1.0)
+    probability: Array = moves.clip(0.0, 1.0)
     return probability
 
 
@@ -186,6 +211,7 @@ class Equilibrium:
         contacts: K contacts.
         areas: Corners (M, 3) [m] of each contact's area.
         fixed: Which objects (N,) do not move.
+        explained: For which pairs (N, N) some draw may close the nearest gap or overlap.
     """
 
     def __init__(self, objects: Sequence[SceneObject], config: SupportConfig) -> None:
@@ -194,10 +220,12 @@ class Equilibrium:
         shapes = [o.shape for o in objects]
         self.contacts = touching(objects, self._fall)
         self._pairs = np.array([(c.a, c.b) for c in self.contacts], dtype=np.intp).reshape(-1, 2)
+        self._uppers = np.array(
+            [c.b if c.normal_world[2] > 0.0 else c.a for c in self.contacts], dtype=np.intp
+        )
         self.fixed = np.array([o.role == "support_surface" for o in objects], dtype=np.bool_)
         if not self.fixed.any():
-            lifted = [c.b if c.normal_world[2] > 0.0 else c.a for c in self.contacts]
-            self.fixed = ~np.isin(np.arange(len(objects)), lifted)
+            self.fixed = ~np.isin(np.arange(len(objects)), self._uppers)
         ends, count = self._pairs[~self.fixed[self._pairs].any(axis=1)].T, len(objects)
         graph = coo_array((np.ones(len(ends[0])), tuple(ends)), shape=(count, count))
         self._islands = connected_components(graph, directed=False)[1]
@@ -207,6 +235,15 @@ class Equilibrium:
         self._reach = np.array([np.linalg.norm(s.extents) / 2.0 for s in shapes])
         self._axes = np.array([s.T_world_object[:3, :3] for s in shapes]).reshape(-1, 3, 3)
         self.areas = [contact_area(c, config) for c in self.contacts]
+        self._sigma = np.array([deviations(o) for o in objects]).reshape(-1, 9)
+        self._rows = gap_rows(objects, self.contacts, self._pairs)
+        self._gaps = np.array([c.distance for c in self.contacts])
+        scatter = np.einsum("kpv,kpv->k", self._rows**2, self._sigma[self._pairs] ** 2) + config.touch**2
+        self._spread = np.sqrt(scatter)
+        self.explained = np.zeros((count, count), dtype=np.bool_)
+        for k in np.argsort(-self._gaps, kind="stable"):  # The smallest gap of a pair counts.
+            (a, b), near = self._pairs[k], abs(self._gaps[k]) <= SIGMAS * self._spread[k]
+            self.explained[a, b] = self.explained[b, a] = near
         self._points = np.concatenate([np.empty((0, 3)), *self.areas])
         self._contact = np.repeat(np.arange(len(self.areas)), [len(area) for area in self.areas])
         self._model = _engine(max(16, 1 << (len(objects) - 1).bit_length()), threading.get_ident())
@@ -218,22 +255,22 @@ class Equilibrium:
 
         Shapes move, turn and grow by their fits' uncertainty. Each contact is closed with the probability
         that its gap implies; before that, no gap is as likely as any gap up to `reach`. Closed gaps correct
-        all shapes, as in `reconcile`. Gaps into which objects fall or tip in the first draw close in all.
+        all shapes, as in `reconcile`. Gaps into which objects fall or tip close too. Those are wider than the
+        uncertainty explains, so hidden sides are further out, nobody knows which: where objects fall in the
+        first draw, further ones take a random share off each gap.
         """
         config, count = self._config, len(self.contacts)
-        sigma = np.array([deviations(o) for o in self._objects]).reshape(-1, 9)
+        sigma, found, rows = self._sigma, self._gaps, self._rows
         variance = sigma**2
         effects = np.array([effect(o.shape.ties) for o in self._objects]).reshape(-1, 9, 9)
         half = np.array([o.shape.extents / 2.0 for o in self._objects]).reshape(-1, 3)
-        found = np.array([c.distance for c in self.contacts])
-        rows = gap_rows(self._objects, self.contacts, self._pairs)
-        scatter = np.einsum("kpv,kpv->k", rows**2, variance[self._pairs]) + config.touch**2
-        odds = np.exp(-(np.maximum(found, 0.0) ** 2) / (2.0 * scatter)) * config.reach
-        shut = odds / (odds + np.sqrt(2.0 * np.pi * scatter))
-        far, fallen = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+        z, width = np.maximum(found, 0.0) / self._spread, config.reach / self._spread
+        odds = width * np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
+        shut = odds / np.maximum(odds + ndtr(width - z) - ndtr(-z), 1e-300)
+        loose = np.zeros(count, dtype=np.bool_)
         for number in range(config.draws):
             first = number == 0
-            change = np.clip(rng.standard_normal(sigma.shape), -3.0, 3.0) * sigma * (not first)
+            change = np.clip(rng.standard_normal(sigma.shape), -SIGMAS, SIGMAS) * sigma * (not first)
             touching = shut > (0.5 if first else rng.random(count))
             gaps = found - np.einsum("kpv,kpv->k", rows, change[self._pairs])
             if touching.any():
@@ -248,14 +285,16 @@ class Equilibrium:
             draw = Draw(
                 np.einsum("nij,nj->ni", self._axes, moved[:, :3]),
                 _likeness(half, moved[:, :3], moved[:, 6:]),
-                np.where(far, np.inf, np.where(touching | fallen, 0.0, np.maximum(gaps, 0.0))),
+                np.where(touching, 0.0, np.maximum(gaps, 0.0)),
                 np.max(frictions[self._pairs], axis=1, initial=0.0),
                 densities,
             )
+            hidden = np.where(loose & ~touching, draw.gaps * rng.random(count), draw.gaps)
+            if first or loose.any():
+                far, fallen = self._landings(replace(draw, gaps=hidden))
             if first:
-                far, fallen = self._landings(draw)
-                draw = replace(draw, gaps=np.where(far, np.inf, np.where(fallen, 0.0, draw.gaps)))
-            yield draw
+                loose = np.isin(self._uppers, self._uppers[fallen])
+            yield replace(draw, gaps=np.where(far, np.inf, np.where(fallen, 0.0, draw.gaps)))
 
     def _landings(self, draw: Draw) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Contacts (K,) that are too far apart to press, and those that objects fall or tip onto.

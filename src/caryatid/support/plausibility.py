@@ -163,7 +163,8 @@ def _changed(shape: Shape, change: Array) -> Shape:
     """Change a shape's independent variables (9,)."""
     change = effect(shape.ties) @ change
     T = shape.T_world_object @ transforms.rigid(transforms.rotation_from_vector(change[3:6]), change[:3])
-    extents = np.maximum(shape.extents + 2.0 * change[6:9], 0.008)  # As of the fits.
+    # As of the fits; thinner ones were cut off at the table, and do not get thicker.
+    extents = np.maximum(shape.extents + 2.0 * change[6:9], np.minimum(shape.extents, 0.008))
     return shape.resized(T, extents)
 
 

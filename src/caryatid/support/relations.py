@@ -129,7 +129,11 @@ def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) 
     index = _index(graph, object_id)
     if graph.objects[index].role == "support_surface":
         raise InputError(object_id, "is the support surface", "ask about one of the objects on it")
-    moves = moved_without(graph.objects, index, config, np.random.default_rng(0))
+    beliefs = np.full(len(graph.objects), np.nan)
+    for s in graph.supports:
+        if s.supporter == object_id:
+            beliefs[_index(graph, s.supported)] = s.belief
+    moves = moved_without(graph.objects, index, beliefs, config, np.random.default_rng(0))
     moving = {o.id: float(p) for o, p in zip(graph.objects, moves, strict=True) if p > 0.0}
     effects = [Effect(i, _loss(graph, i, {object_id, *moving}), p) for i, p in moving.items()]
     return tuple(sorted(effects, key=lambda e: -e.probability))

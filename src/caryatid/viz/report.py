@@ -224,7 +224,7 @@ def _answer(
         figures.append(Figure("In 3D" if wide else "", solid, caption, share=2 if wide else 1, page=page))
     yield Section("Answer", text, figures if wide else figures[:2], facts)
     doubtful = doubts(graph)
-    nothing = f"Nothing: all supports have a probability of at least {DOUBTFUL}, and all shapes fit."
+    nothing = f"Nothing: all supports have a probability above {DOUBTFUL}, and all shapes fit."
     more = [("More", f"{len(doubtful) - MOST} others; see the tables.")] if len(doubtful) > MOST else []
     yield Section("What is doubtful", "" if doubtful else nothing, facts=doubtful[:MOST] + more)
     if figures[2:] and not wide:
