@@ -18,7 +18,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.polygons import area
 from caryatid.geometry.shapes import Box, Cylinder, Sphere, Uncertainty
 from caryatid.geometry.transforms import UP, rigid
-from caryatid.graph import SceneObject
+from caryatid.graph import SceneObject, Support
 from caryatid.support.contacts import Contact, find_contacts, find_gap
 from caryatid.support.equilibrium import support_forces
 from caryatid.support.plausibility import closing, drawn, reconcile
@@ -295,6 +295,23 @@ class TestInfer:
         assert {s.supporter for s in graph.supporters("o1")} == {"o0"}
         assert graph.stability["o1"].tips
 
+    @pytest.mark.parametrize("gap", [0.015, -0.02])
+    def test_what_no_uncertainty_explains_is_doubtful(self, gap):
+        """A gap, and an overlap, of five standard deviations and more."""
+        known = unsure(0.002, 0.0)
+        objects = [SURFACE, thing(1, (0, 0, 0.05), known), thing(2, (0, 0, 0.15 + gap), known)]
+        support = infer(objects, CONFIG).support("o1", "o2")
+        assert support.doubtful
+        assert support.kind == "bottom-up"
+
+    def test_what_could_carry_a_floating_board_shares_the_probability(self):
+        """A ball is nearest, two pillars are a little further below, and any of them may be hidden higher."""
+        pillars = [block(0, y, 0, (0.06, 0.06, 0.11)) for y in (-0.15, 0.15)]
+        ball, board = Sphere(at(0.01, 0.0, 0.085), 0.03), block(0, 0, 0.13, (0.16, 0.42, 0.02))
+        graph = infer(scene(*pillars, ball, board, uncertainty=unsure(0.002, 0.0)), replace(CONFIG, draws=60))
+        assert {s.supporter for s in graph.supporters("o4")} >= {"o1", "o2"}
+        assert all(s.doubtful for s in graph.supporters("o4"))
+
     def test_what_touches_nothing_is_let_down(self):
         objects = scene(block(0, 0, 0, (0.1, 0.1, 0.05)), block(0.02, 0, 0.08, (0.05, 0.05, 0.05)))
         graph = infer(objects, CONFIG)
@@ -394,7 +411,7 @@ def test_true_shapes_of_the_shared_primitive_scenes_give_their_edges():
     from caryatid.simulation.world import static_boxes, true_shapes
 
     right = wrong = missed = 0
-    for folder in [f for f in sorted(SCENES.iterdir()) if not f.name.startswith(("ycb", "house"))]:
+    for folder in [f for f in sorted(SCENES.iterdir()) if not f.name.startswith(("ycb", "house", "storey"))]:
         loaded = load_scene(str(folder / "scene.xml"))
         names = {0: "table", **loaded.object_bodies}
         objects = [
@@ -441,7 +458,7 @@ class TestProbabilities:
             return self.likely([SURFACE, first, second, slab], replace(CONFIG, draws=60)).get(("o2", "o3"))
 
         assert shown(0.0002) is None
-        assert 0.55 < shown(0.003) < 0.98
+        assert 0.5 < shown(0.003) < 0.98
 
     def test_an_object_whose_size_is_a_guess_is_less_likely_the_one_it_is_taken_for(self):
         sides = scene(cube(0, 0, 0.05), uncertainty=unsure(0.001, high_x=0.1))
@@ -460,7 +477,7 @@ class TestProbabilities:
 class TestRemoval:
     def effects(self, objects, taken):
         found = predict_removal(infer(objects, CONFIG), taken, CONFIG)
-        return {e.object_id: e.probability == 1.0 for e in found}
+        return {e.object_id: e.probability > 0.95 for e in found}
 
     def test_all_that_stands_on_it_falls_for_certain(self):
         assert self.effects(tower(), "o1") == {"o2": True, "o3": True}
@@ -488,6 +505,13 @@ class TestRemoval:
         assert self.effects(counterweight(), "o3") == {"o2": True}
         rider = SceneObject("o4", 4, Sphere(at(0.24, 0.0, 0.14), 0.02))
         assert "o4" in self.effects([*counterweight(), rider], "o3")
+
+    def test_what_an_earlier_view_was_surer_of_still_counts(self):
+        graph = infer(scene(*(o.shape for o in tower()[1:])), CONFIG)
+        assert predict_removal(graph, "o4", CONFIG) == ()
+        earlier = Support("o4", "o3", probability=0.6)
+        (effect,) = predict_removal(replace(graph, supports=(*graph.supports, earlier)), "o4", CONFIG)
+        assert (effect.object_id, effect.probability) == ("o3", pytest.approx(0.6))
 
     def test_unknown_objects_and_the_table_are_refused(self):
         graph = infer(tower(), CONFIG)

@@ -92,7 +92,7 @@ def _square_up(shape: Array, axis: int, points: Array) -> None:
     u, v = (axis + 1) % 3, (axis + 2) % 3
     places = (points @ shape[:3])[:, [u, v]]
     rectangle = shapely.get_coordinates(shapely.oriented_envelope(shapely.MultiPoint(places)))
-    along = rectangle[1] - rectangle[0]  # Of points on a line, the line.
+    along = rectangle[-1] - rectangle[-2] if len(rectangle) > 1 else np.array([1.0, 0.0])
     turn = np.arctan2(along[1], along[0])
     turn -= np.round(turn / (np.pi / 2.0)) * (np.pi / 2.0)
     c, s = np.cos(turn), np.sin(turn)

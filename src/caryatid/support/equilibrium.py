@@ -71,7 +71,8 @@ def support_forces(
         rng: Source of the draws.
     """
     scene, count = Equilibrium(objects, config), len(objects)
-    held, forces, total = np.zeros((count, count)), np.zeros((count, count, 3)), np.zeros(count)
+    at_rest, moving = np.zeros((2, count, count))
+    forces, total = np.zeros((count, count, 3)), np.zeros(count)
     alike, needed = np.zeros(count), np.ones((count, count), dtype=np.bool_)
     visible = np.where(scene.explained, 1.0, 1.0 - config.unexplained)
     for number, draw in enumerate(scene.draws(rng)):
@@ -86,11 +87,13 @@ def support_forces(
             fell[group] = presses[group] & (motion > balance.motion + config.at_rest)
         if number == 0:
             needed = fell
-        held += (carries | (fell & rests)) * trust * np.where(rests, visible, 1.0 - config.unexplained)
+        at_rest += (carries | fell) & rests
+        moving += (carries & ~rests) * config.unexplained
         forces += balance.pushes * trust[:, None]
         total += trust
         alike += draw.likeness >= 0.5
-    shares = (held / total).clip(0.0, 1.0)
+    # Divided before they are weighted: rounding must not exceed the weight.
+    shares = (visible * (at_rest / total) + (1.0 - config.unexplained) * (moving / total)).clip(0.0, 1.0)
     return SupportForces(shares, forces / total[:, None], alike / config.draws, scene.contacts, scene.areas)
 
 
@@ -291,21 +294,22 @@ class Equilibrium:
             )
             hidden = np.where(loose & ~touching, draw.gaps * rng.random(count), draw.gaps)
             if first or loose.any():
-                far, fallen = self._landings(replace(draw, gaps=hidden))
+                far, fallen = self._landings(draw, hidden)
             if first:
                 loose = np.isin(self._uppers, self._uppers[fallen])
             yield replace(draw, gaps=np.where(far, np.inf, np.where(fallen, 0.0, draw.gaps)))
 
-    def _landings(self, draw: Draw) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def _landings(self, draw: Draw, hidden: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Contacts (K,) that are too far apart to press, and those that objects fall or tip onto.
 
-        Objects tip as far as `reach`; those that nothing carries fall as far as `max_drop`.
+        Objects tip as far as `reach`; those that nothing carries fall as far as `max_drop`, onto what the
+        hidden gaps (K,) [m] let them meet first.
         """
         far = draw.gaps > self._config.reach
-        upwards = self.solve(replace(draw, gaps=np.where(far, np.inf, draw.gaps))).pushes[..., 2].sum(axis=0)
+        upwards = self.solve(replace(draw, gaps=np.where(far, np.inf, hidden))).pushes[..., 2].sum(axis=0)
         loose = (upwards <= self._config.force_share) & ~self.fixed
         far &= ~loose[self._pairs].any(axis=1)
-        pressed = self.solve(replace(draw, gaps=np.where(far, np.inf, draw.gaps))).pressed
+        pressed = self.solve(replace(draw, gaps=np.where(far, np.inf, hidden))).pressed
         return far, pressed & (draw.gaps > self._config.at_rest * self._fall)
 
     def independent(self, indices: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
