@@ -63,11 +63,13 @@ class RobotClient:
         view["number"] = self.session(name)["views"] if number is None else number
         return self._ask("POST", f"/sessions/{name}/views", view)
 
-    def next(self, name: str, candidates: list[Matrix] | None = None) -> dict[str, Any]:
+    def next(
+        self, name: str, candidates: list[Matrix] | None = None, refused: list[Matrix] | None = None
+    ) -> dict[str, Any]:
         """Return the next best view for the humanoid of the settings, or among these camera poses."""
-        if candidates is None:
+        if candidates is None and refused is None:
             return self._ask("GET", f"/sessions/{name}/next")
-        return self._ask("POST", f"/sessions/{name}/next", {"T_world_camera": candidates})
+        return self._ask("POST", f"/sessions/{name}/next", {"T_world_camera": candidates, "refused": refused})
 
     def graph(self, name: str) -> dict[str, Any]:
         """The support graph, as graph.json."""

@@ -8,14 +8,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from arms import within_arms_length
 from conftest import refusal, wall_of
 from synthetic import FEW_VIEWS, model_of, simulated_scene, simulated_views
 
+from caryatid.config import ArmConfig
 from caryatid.errors import InputError, NoSurfaceError, PlanningError
 from caryatid.exploration import Explorer, explore, next_best_view
 from caryatid.geometry import transforms
 from caryatid.io import read_recording, write_recording
 from caryatid.io.graph_json import graph_text
+from caryatid.robots import Unreachable
+from caryatid.robots.arm import ArmRobot
+from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.robots.recording import RecordingCamera, RecordingRobot
 from caryatid.scene import Scene
 from caryatid.simulation.setup import make_simulation
@@ -142,6 +147,103 @@ def test_a_robot_may_return_poses_alone():
     robots = (kind([v.pose for v in views]) for kind in (RecordingRobot, Bare))
     first, second = (next_best_view(model_of(views[:1], FEW_VIEWS), robot) for robot in robots)
     np.testing.assert_array_equal(first.T_world_camera, second.T_world_camera)
+
+
+class Shy:
+    """A robot whose motion planner fails three times in ten, when it checks and when it moves."""
+
+    def __init__(self, rng, *given):
+        super().__init__(*given)
+        self.rng = rng
+
+    def fails(self):
+        return self.rng.random() < 0.3
+
+    def confirm(self, T_world_camera):
+        return Unreachable("no path found") if self.fails() else super().confirm(T_world_camera)
+
+    def move_to(self, T_world_camera):
+        if self.fails():
+            raise PlanningError("the motion stopped")
+        return super().move_to(T_world_camera)
+
+
+class ShyHumanoid(Shy, HumanoidRobot):
+    pass
+
+
+class ShyArm(Shy, ArmRobot):
+    pass
+
+
+class Bare:
+    """The protocol alone, around another robot."""
+
+    def __init__(self, robot):
+        self.robot, self.fails = robot, robot.fails
+
+    @property
+    def T_world_camera(self):
+        return self.robot.T_world_camera
+
+    def candidates(self, sphere):
+        return self.robot.candidates(sphere)
+
+    def solve(self, T_world_camera):
+        return Unreachable("no path found") if self.fails() else self.robot.solve(T_world_camera)
+
+    def move_to(self, T_world_camera):
+        return self.robot.move_to(T_world_camera)
+
+
+def shy_robot(kind, seed):
+    """Makes a robot of one of three kinds."""
+    rng = np.random.default_rng(seed)
+
+    def made(around):
+        if kind == "arm":
+            T_world_base = transforms.rigid(np.eye(3), around.centre_world + np.array([-0.5, 0.0, 0.0]))
+            config = ArmConfig(sphere_points=600, radius_views=200)
+            return ShyArm(rng, within_arms_length, T_world_base, config)
+        robot = ShyHumanoid(rng, around.floor, around.config.robot)
+        return Bare(robot) if kind == "bare" else robot
+
+    return made
+
+
+@pytest.mark.parametrize("kind", ["arm", "humanoid", "bare"])
+@pytest.mark.parametrize("scene", ["tower", "bridge"])
+def test_motions_that_fail_do_not_end_it(kind, scene, caplog):
+    for seed in range(4):
+        maker = shy_robot(kind, seed)
+        set_up = make_simulation(simulated_scene(scene), FEW_VIEWS, noise="none", seed=seed, robot=maker)
+        steps = list(explore(set_up.camera, set_up.robot, config=FEW_VIEWS, early_stop=False))
+        assert [step.index for step in steps] == [0, 1, 2]
+        assert steps[-1].stop == "maximum of 3 views reached"
+    assert "put aside: the motion stopped" in caplog.text
+
+
+def test_where_every_motion_fails_the_last_step_says_why(tmp_path):
+    set_up = stage()
+    set_up.robot.move_to = lambda T_world_camera: exec("raise PlanningError('the motion stopped')")
+    explorer = Explorer(set_up.camera, set_up.robot, config=FEW_VIEWS)
+    explorer.look()
+    planned = explorer.plan()
+    ended = explorer.go()
+    assert ended.decision is None
+    assert ended.stop == "the robot refused 20 views in a row: the motion stopped"
+    assert len(planned.candidates) - len(ended.candidates) == 20
+    assert ended.candidates.rejected["the motion stopped"] == 20
+    steps = list(explore(set_up.camera, set_up.robot, config=FEW_VIEWS))
+    assert [(step.index, step.stop) for step in steps] == [(0, None), (0, ended.stop)]
+    run = written(tmp_path / "run", steps)
+    assert [step.stop for step in read_steps(run)] == [ended.stop], "it replaces the step before"
+    poses = [view.pose for view in simulated_views("tower")]
+    few = RecordingRobot(poses)
+    few.move_to = set_up.robot.move_to
+    *_, last = explore(set_up.camera, few, config=FEW_VIEWS)
+    assert last.stop.startswith("no candidate views left: ")
+    assert last.stop.endswith("the motion stopped (2)")
 
 
 def test_a_person_may_choose_another_view_and_another_planner():

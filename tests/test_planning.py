@@ -213,11 +213,15 @@ class TestCandidates:
 
     def test_a_refused_view_is_left_out_and_counted(self):
         two = Candidates(OPEN.T_world_camera[:2], OPEN.directions[:2], np.array([0.5, 1.0]), {"wall": 3})
-        left = two.without(0, "wall").without(0, "arm")
+        first, second = two.T_world_camera
+        left = two.without(first, "wall").without(second, "arm")
         assert len(left) == 0
         assert left.rejected == {"wall": 4, "arm": 1}
-        assert two.without(0, "arm").path_length.tolist() == [1.0]
-        assert OPEN.without(5, "arm").indices.tolist() == np.delete(OPEN.indices, 5).tolist()
+        assert two.without(first, "arm").path_length.tolist() == [1.0]
+        assert (
+            OPEN.without(OPEN.T_world_camera[5], "arm").indices.tolist()
+            == np.delete(OPEN.indices, 5).tolist()
+        )
         assert repr(two) == "Candidates(2; refused: 3 wall)"
 
 

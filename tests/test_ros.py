@@ -137,11 +137,12 @@ class Bench:
 
 
 class Handle:
-    """A goal handle; its client moves the camera to each next view."""
+    """A goal handle; its client moves the camera to each next view, but refuses the first few."""
 
-    def __init__(self, bench, moves=True, cancel_at=None, **goal):
+    def __init__(self, bench, moves=True, refuses=0, cancel_at=None, **goal):
         self.request = make("caryatid_msgs/action/Explore/Goal", **goal)
-        self.bench, self.moves, self.cancel_at, self.feedback, self.ended = bench, moves, cancel_at, [], []
+        self.bench, self.moves, self.refuses = bench, moves, refuses
+        self.cancel_at, self.feedback, self.ended = cancel_at, [], []
         self.succeed, self.abort, self.canceled = (
             lambda end=end: self.ended.append(end) for end in ("succeeded", "aborted", "canceled")
         )
@@ -153,7 +154,10 @@ class Handle:
     def publish_feedback(self, message):
         self.feedback.append(packed(message))
         pose = message.decision.camera.pose
-        if self.moves:
+        if len(self.feedback) <= self.refuses:
+            told = self.bench.logic.refused(make("caryatid_msgs/srv/Refused/Request", reason="no path"))
+            assert packed(told).success
+        elif self.moves:
             T = messages.matrix_of(pose.orientation, pose.position, "camera")
             self.bench.T_world_camera = T
 
@@ -308,6 +312,17 @@ def test_a_cancelled_goal_stops_before_the_next_view(bench):
     end, result = Handle(bench, moves=False, cancel_at=1).run()
     assert (end, result.message, result.views, len(bench.seen)) == ("canceled", "cancelled", 1, 1)
     assert len(result.graph.objects) > 1
+
+
+def test_a_view_that_the_motion_planner_refuses_is_replaced_by_another(bench):
+    handle = Handle(bench, refuses=2, max_views=2)
+    end, result = handle.run()
+    assert (end, result.message, len(handle.feedback)) == ("succeeded", "maximum of 2 views reached", 3)
+    assert len({repr(message.decision.camera.pose) for message in handle.feedback}) == 3
+    end, result = Handle(bench, refuses=99, max_views=2).run()
+    assert (end, result.message) == ("succeeded", "the robot refused 20 views in a row: no path")
+    told = packed(bench.logic.refused(make("caryatid_msgs/srv/Refused/Request")))
+    assert (told.success, told.message) == (False, "no next view is awaited")
 
 
 def test_what_goes_wrong_ends_in_one_sentence(bench):
@@ -490,7 +505,11 @@ def test_the_node_connects_its_topics(monkeypatch):
         "markers",
         "decision",
     ]
-    assert [call.args[1] for call in Node.create_service.call_args_list] == ["order", "removed"]
+    assert [call.args[1] for call in Node.create_service.call_args_list] == [
+        "order",
+        "removed",
+        "refused",
+    ]
     assert sys.modules["rclpy.action"].ActionServer.call_args.args[2:] == ("explore", node.logic.explore)
     sys.modules["tf2_ros"].Buffer.return_value.lookup_transform.side_effect = LostError("two trees")
     with pytest.raises(LookupError, match="two trees"):

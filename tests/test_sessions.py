@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import npy, wall_of
+from conftest import npy, refusal, wall_of
 from filelock import FileLock
 
 from caryatid.config import Config
@@ -106,6 +106,15 @@ def test_the_next_view_is_where_the_robot_can_be(begun):
     assert outside.max() > robot.footprint - robot.cell - 0.02
 
 
+def test_a_view_to_which_the_robot_cannot_go_is_not_chosen_again(begun):
+    refused = []
+    with Session.open(begun, read_only=True) as session:
+        for _ in range(3):
+            answer = json.loads(json.dumps(session.next(refused=refused).to_json()))
+            refused.append(answer["T_world_camera"])
+    assert len({str(T) for T in refused}) == 3
+
+
 def test_a_robot_may_say_itself_what_it_reaches(begun):
     centre, lengths = np.array([0.0, 0.0, 0.7]), (1.0, 2.0, 0.5)
     offsets = ((1.0, 0.0, 0.5), (0.0, -0.8, 0.9), (0.0, 0.8, 0.9))
@@ -119,6 +128,8 @@ def test_a_robot_may_say_itself_what_it_reaches(begun):
         assert np.allclose(np.array(costs) / costs[0], lengths)
         with pytest.raises(PlanningError, match="no candidate views left"):
             session.next([])
+        with refusal("refused", "omit them"):
+            session.next(poses, refused=poses[:1])
         for wrong in ([1.0], [1.0, 2.0, -0.5]):
             with pytest.raises(InputError, match="path_length"):
                 session.next(poses, wrong)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from types import NoneType
@@ -16,11 +17,11 @@ from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Change, SupportGraph, TakeStep
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.decision import Decision, Planner, PlanningState, path_cost
+from caryatid.planning.decision import Decision, Planner, PlanningState, check_candidates, path_cost
 from caryatid.planning.goals import settled
 from caryatid.planning.planners import make_planner
 from caryatid.planning.planners.hidden_surface import SupportPlanner
-from caryatid.robots import Posture, Robot, refusal_of, view_sphere_of, waypoints_of
+from caryatid.robots import Posture, Robot, Unreachable, view_sphere_of, way_to
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.protocol import straight_lengths
 from caryatid.runtime.display import Pictured
@@ -28,6 +29,8 @@ from caryatid.runtime.parallel import one_blas_thread
 from caryatid.scene import Scene, Stopwatch
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Camera, Cloud, View
+
+log = logging.getLogger(__name__)
 
 UNTIL = 0.95
 """Default probability at which the effects of removing the goal count as known [1]."""
@@ -69,7 +72,8 @@ class Step(Pictured):
         sphere: The view sphere of the robot.
         visited: Unit directions (V, 3) of the views so far from the sphere's centre.
         candidates: The views that could be reached next, or None if the loop stops.
-        decision: The next view, or None if the loop stops.
+        decision: The next view, or None if the loop stops. If the robot cannot go there, a warning says
+            why, and the next step shows the view that was chosen instead.
         timings: Seconds of each stage.
         angle_travelled: Sum of the angles between consecutive views at the sphere's centre [rad].
         path_travelled: Path length [m] of a platform or of an arm's hand; without a robot, of the camera.
@@ -105,6 +109,8 @@ class Step(Pictured):
 
 class Explorer:
     """Explores a scene one view at a time: call `look()`, `plan()` and `go()` in turn.
+
+    If something else moves the camera, it takes the place of `go()`; call `put_aside` if it cannot go there.
 
     Between two calls, `use_planner` replaces the planner and `choose` replaces the next view.
 
@@ -160,6 +166,7 @@ class Explorer:
         self._until = UNTIL if until is None and goal is not None else until
         self.robot = robot
         self.step: Step | None = None
+        self._aside: list[tuple[Array, str]] = []
         self._camera = camera
         self.use_planner(planner)
 
@@ -206,6 +213,7 @@ class Explorer:
         watch.lap("capture")
         for taken in self.scene.updates(given):
             self.step = self._step(taken, watch.laps["capture"], kept=taken is not given)
+            self._aside = []
             yield self.step
 
     def _step(self, source: View | Cloud, captured: float, *, kept: bool) -> Step:
@@ -250,6 +258,10 @@ class Explorer:
         candidates: Candidates | None = None
         try:
             candidates = reachable_views(robot, step.sphere)
+            for T_world_camera, why in self._aside:
+                candidates = candidates.without(T_world_camera, why)
+            if len(self._aside) >= ATTEMPTS:
+                raise _refused_all(self._aside[-1][1])
             decision, candidates = _decide(self._state(candidates), robot, self._planner, self.scene.seed)
         except PlanningError as error:
             stop = str(error)
@@ -293,10 +305,10 @@ class Explorer:
         )
         decision = chosen if isinstance(chosen, Decision) else self._by_hand(int(chosen))
         robot, T_world_camera = self._moving(), decision.T_world_camera
-        refused = refusal_of(robot, T_world_camera)
-        if refused is not None:
-            raise PlanningError(refused.reason)
-        decision = decision.with_waypoints(waypoints_of(robot, T_world_camera))
+        way = way_to(robot, T_world_camera)
+        if isinstance(way, Unreachable):
+            raise PlanningError(way.reason)
+        decision = decision.with_waypoints(way)
         self.step = replace(self._newest(), decision=decision, stop=None)
         return self.step
 
@@ -311,17 +323,47 @@ class Explorer:
         decision = replace(step.decision, T_world_camera=T_world_camera, index=index, why="chosen by hand")
         return replace(decision, saliency=saliency, cost=cost, score=score)
 
-    def go(self) -> None:
-        """Move the robot to the next view.
+    def go(self) -> Step:
+        """Move the robot to the next view; put views aside to which it cannot go, and go to another.
+
+        Returns:
+            The newest step, with the view to which the robot went; if it can go to none, without a decision,
+            and `stop` gives the reason.
 
         Raises:
-            PlanningError: No view is planned, or it cannot be reached.
+            PlanningError: No view is planned.
+        """
+        step, robot = self._newest(), self._moving()
+        if step.decision is None:
+            raise PlanningError("no next view is planned; call plan() first")
+        while step.decision is not None:
+            try:
+                path = robot.move_to(step.decision.T_world_camera)
+            except PlanningError as error:
+                step = self.put_aside(str(error))
+            else:
+                step = self.step = replace(step, path_travelled=step.path_travelled + path)
+                break
+        return step
+
+    def put_aside(self, why: str) -> Step:
+        """Put the next view aside, because the robot cannot go there, and plan again among the others.
+
+        Args:
+            why: The reason.
+
+        Returns:
+            The newest step, as from `plan`.
+
+        Raises:
+            PlanningError: No view is planned.
         """
         step = self._newest()
         if step.decision is None:
             raise PlanningError("no next view is planned; call plan() first")
-        path = self._moving().move_to(step.decision.T_world_camera)
-        self.step = replace(step, path_travelled=step.path_travelled + path)
+        self._aside.append((step.decision.T_world_camera, why))
+        log.warning("%s: the robot cannot go to the next view, which is put aside: %s", step.name, why)
+        return self.plan()
 
     def _state(self, candidates: Candidates) -> PlanningState:
         step = self._newest()
@@ -373,7 +415,7 @@ def explore(
         early_stop: Whether to stop before `max_views`, by `config.active.stop` and `until`.
 
     Yields:
-        A step after each view.
+        A step after each view; the last one again, with `stop`, if the robot can go to no further view.
 
     Raises:
         CaryatidError: A view cannot be used, or the planner is unknown.
@@ -388,12 +430,13 @@ def explore(
             reason = explorer.reason_to_stop() if early_stop and step.stop is None else None
         if reason is not None:
             step = replace(step, candidates=None, decision=None, stop=reason)
-        if step.stop is not None and goal is not None and all(o.id != goal for o in step.graph.objects):
-            step = replace(step, stop=f"{step.stop}; {goal} was not found")
-        yield step
-        if step.decision is None:
+        if step.decision is not None:
+            yield step
+            step = explorer.go()
+        if step.stop is not None:
+            lost = goal is not None and all(o.id != goal for o in step.graph.objects)
+            yield replace(step, stop=f"{step.stop}; {goal} was not found") if lost else step
             return
-        explorer.go()
 
 
 def reason_to_stop(state: PlanningState, changed: bool, planner: Planner, decision: Decision) -> str | None:
@@ -527,15 +570,19 @@ def _decide(
     rng = np.random.default_rng([seed, len(state.visited)])
     why = ""
     for _ in range(ATTEMPTS):
+        check_candidates(state)
         decision = planner.plan(state, rng)
         check_type("the planner's choice", decision, Decision, "return a Decision from plan()")
-        refused = refusal_of(robot, decision.T_world_camera)
-        if refused is None:
-            waypoints = waypoints_of(robot, decision.T_world_camera)
-            return decision.with_waypoints(waypoints), state.candidates
-        why = refused.reason
-        state = replace(state, candidates=state.candidates.without(decision.index, why))
-    raise PlanningError(f"the robot refused {ATTEMPTS} views in a row: {why}")
+        way = way_to(robot, decision.T_world_camera)
+        if not isinstance(way, Unreachable):
+            return decision.with_waypoints(way), state.candidates
+        why = way.reason
+        state = replace(state, candidates=state.candidates.without(decision.T_world_camera, why))
+    raise _refused_all(why)
+
+
+def _refused_all(why: str) -> PlanningError:
+    return PlanningError(f"the robot refused {ATTEMPTS} views in a row: {why}")
 
 
 def _state(

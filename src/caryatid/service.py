@@ -444,8 +444,8 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @app.post("/sessions/{name}/next", response_model=NextAnswer)
     @queued
     def choose_next_view(name: SessionName, given: CandidateViews) -> Any:
-        """Plan the next best view among poses that your robot can reach."""
-        return pool.session(name).next(given.T_world_camera, given.path_length).to_json()
+        """Plan the next best view among poses that your robot can reach, or without those that it cannot."""
+        return pool.session(name).next(**given.arguments).to_json()
 
 
 class Gate:

@@ -87,7 +87,7 @@ class RunWriter(StagedFolder):
             self.written |= {name for name in self.past.record["files"] if (self._place / name).exists()}
 
     def add(self, step: Step, score: Mapping[str, Any] | None = None) -> None:
-        """Write the next view.
+        """Write the next view, or the newest one again with its `stop`.
 
         Points and normals of the cloud are rounded to float32; all else is read back unchanged.
 
@@ -98,6 +98,8 @@ class RunWriter(StagedFolder):
         Raises:
             InputError: Labels exceed 16 bits, or the disk cannot be written.
         """
+        if step.stop is not None and self.steps and self.steps[-1]["view"] == step.index:
+            del self.steps[-1], self._scores[len(self.steps) :]
         number = len(self.steps)
         labels, folder = step.labels, _view_folder(number)
         if labels.size and not 0 <= labels.min() <= labels.max() <= SUPPORT_LABEL:

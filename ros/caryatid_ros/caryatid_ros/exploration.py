@@ -1,4 +1,4 @@
-"""What the node does: explore, order and removed, in terms of a few functions that a node provides."""
+"""What the node does: its action and services, in terms of a few functions that a node provides."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.io.mask_sources import mask_source, without_ignored
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.candidates import Candidates
+from caryatid.planning.decision import Decision
 from caryatid.planning.planners import make_planner
 from caryatid.planning.posture import Posture
 from caryatid.robots import OwnViews, Robot, RobotMaker, Surroundings, Unreachable, find_robot, view_sphere_of
@@ -121,8 +122,8 @@ class CarriedCamera(OwnViews):
         return self.model.solve(T_world_camera)
 
     def move_to(self, T_world_camera: Array) -> float:
-        """Raise PlanningError: only the motion planner moves the camera."""
-        raise PlanningError("only the motion planner of the robot moves the camera")
+        """Raise RuntimeError: only the motion planner moves the camera."""
+        raise RuntimeError("only the motion planner of the robot moves the camera")
 
 
 class Exploration:
@@ -145,6 +146,7 @@ class Exploration:
         self._explorer: Explorer | None = None
         self._header: Any = None
         self._scene_lock, self._goal_lock = Lock(), Lock()
+        self._awaited, self._refusal = False, ""
 
     def explore(self, handle: Any) -> Any:
         """Take views until no further view is worth its path, and return an Explore result.
@@ -165,7 +167,7 @@ class Exploration:
                 views += 1
                 stop = self._plan(explorer) if views < limit else f"maximum of {views} views reached"
                 if stop is None:
-                    since = self._follow(explorer, views, handle)
+                    since, stop = self._follow(explorer, views, handle)
             if request.goal and all(o.id != request.goal for o in explorer.scene.graph.objects):
                 stop = f"{stop}; {request.goal} was not found"
             handle.succeed()
@@ -210,6 +212,15 @@ class Exploration:
         except CaryatidError as error:
             reply["message"] = in_one_line(error)
         return self._ros.make("caryatid_msgs/srv/Removed/Response", **reply)
+
+    def refused(self, request: Any) -> Any:
+        """Report that the camera cannot go to the next view, and return a Refused response."""
+        reply: dict[str, Any] = {"success": self._awaited}
+        if self._awaited:
+            self._refusal = request.reason or "the motion planner refuses it"
+        else:
+            reply["message"] = "no next view is awaited"
+        return self._ros.make("caryatid_msgs/srv/Refused/Response", **reply)
 
     def _known(self) -> Explorer:
         if self._header is None or self._explorer is None:
@@ -266,11 +277,29 @@ class Exploration:
             step = explorer.plan()
             return step.stop or explorer.reason_to_stop()
 
-    def _follow(self, explorer: Explorer, views: int, handle: Any) -> float:
-        """Publish the next view, wait until the camera is there, and return the time [s]."""
+    def _follow(self, explorer: Explorer, views: int, handle: Any) -> tuple[float, str | None]:
+        """Have the camera moved to the next view, or to another if it is refused.
+
+        Returns:
+            The time of arrival [s], and why the camera can go to no further view, or None.
+        """
         assert explorer.step is not None
-        assert explorer.step.decision is not None
-        settings, decision = self._settings, explorer.step.decision
+        while (decision := explorer.step.decision) is not None:
+            try:
+                return self._awaited_at(decision, views, handle), None
+            except PlanningError as error:
+                with self._scene_lock:
+                    explorer.put_aside(str(error))
+        return self._ros.now(), explorer.step.stop
+
+    def _awaited_at(self, decision: Decision, views: int, handle: Any) -> float:
+        """Publish the next view, wait until the camera is there, and return the time [s].
+
+        Raises:
+            PlanningError: It was reported that the camera cannot go there.
+        """
+        settings = self._settings
+        self._awaited, self._refusal = True, ""
         message = messages.decision_message(self._ros.make, decision, self._header)
         self._ros.publish("decision", message)
         fields = {"views": views, "decision": message}
@@ -281,6 +310,8 @@ class Exploration:
             return float(np.linalg.norm(T[:3, 3])), float(Rotation.from_matrix(T[:3, :3]).magnitude())
 
         def arrived() -> float | None:
+            if self._refusal:
+                raise PlanningError(self._refusal)
             distance, angle = away()
             there = distance <= settings.position_tolerance and angle <= settings.angle_tolerance
             return self._ros.now() if there else None
@@ -288,9 +319,13 @@ class Exploration:
         def late() -> InputError:
             where = "is {:.2f} m and {:.2f} rad from the next view".format(*away())
             reason = f"{where} after {settings.move_timeout:g} s"
-            return InputError("camera", reason, "move it there, or raise move_timeout or the tolerances")
+            remedy = "move it there, call the service refused, or raise move_timeout or the tolerances"
+            return InputError("camera", reason, remedy)
 
-        return float(self._poll(handle, settings.move_timeout, arrived, late))
+        try:
+            return float(self._poll(handle, settings.move_timeout, arrived, late))
+        finally:
+            self._awaited = False
 
     def _poll(
         self, handle: Any, seconds: float, ready: Callable[[], Any], late: Callable[[], InputError]

@@ -10,7 +10,7 @@ from typing import Any
 import rclpy
 from caryatid_msgs.action import Explore
 from caryatid_msgs.msg import Decision, SupportGraph
-from caryatid_msgs.srv import Order, Removed
+from caryatid_msgs.srv import Order, Refused, Removed
 from message_filters import ApproximateTimeSynchronizer, Subscriber
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -31,7 +31,7 @@ PUBLISHED = {"support_graph": SupportGraph, "markers": MarkerArray, "decision": 
 
 
 class ExplorationNode(Node):
-    """Takes views, and offers the action `explore` and the services `order` and `removed`.
+    """Takes views, and offers the action `explore` and the services `order`, `removed` and `refused`.
 
     Raises:
         CaryatidError: A parameter cannot be used.
@@ -66,6 +66,7 @@ class ExplorationNode(Node):
         group = ReentrantCallbackGroup()
         self.create_service(Order, "order", lambda r, _: self.logic.order(r), callback_group=group)
         self.create_service(Removed, "removed", lambda r, _: self.logic.removed(r), callback_group=group)
+        self.create_service(Refused, "refused", lambda r, _: self.logic.refused(r), callback_group=group)
         self._server = ActionServer(
             self, Explore, "explore", self.logic.explore,
             cancel_callback=lambda _: CancelResponse.ACCEPT, callback_group=group,

@@ -232,6 +232,8 @@ def _rows(episode: Episode) -> list[Row]:
         times = dict(zip(TIMES, (planning, sum(perceiving)), strict=True))
         figures = figures_of(found, step.graph, len(truth.objects))
         forecasts = {"forecasts": [list(forecast) for forecast in found.forecasts]}
+        if rows and rows[-1]["view"] == view:  # The robot could go to no further view.
+            break
         rows.append({"view": view} | figures | travelled | times | removal | forecasts)
         planning = step.timings.get("plan", 0.0)
     missing = range(int(rows[-1]["view"]) + 1, episode.views + 1)

@@ -423,7 +423,10 @@ def _record(
         writer.add(step, None if scored is None else asdict(scored))
         if last is None:
             output.say(heading)
-        output.step(step, None if last is None else last.graph, scored)
+        if last is not None and step.index == last.index:
+            output.say(f"  done: {step.stop}")
+        else:
+            output.step(step, None if last is None else last.graph, scored)
         if page is not None:
             page.add(step, None if scored is None else scored.f1)
         last = step

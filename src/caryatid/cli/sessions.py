@@ -118,7 +118,8 @@ class Add(SessionStep):
 class Next(SessionStep):
     """Print the next best view as JSON: camera pose, platform pose, gaze, expected gain and reason.
 
-    candidates.json: {"T_world_camera": [4×4 …] reachable poses, "path_length": [m …] (optional)}
+    candidates.json: {"T_world_camera": [4×4 …] reachable poses, "path_length": [m …], "refused": [4×4 …]
+    poses to which the robot cannot go after all}; all are optional
 
     Usage examples:
       caryatid session next table
@@ -126,7 +127,7 @@ class Next(SessionStep):
     """
 
     candidates: Annotated[Path | None, options.shown("C.json")] = None
-    """Candidate poses to choose from, instead of those that the session's robot reaches."""
+    """Candidate poses to choose from, instead of those that the session's robot reaches; or poses to omit."""
 
     def __call__(self) -> None:
         from caryatid.io.json_files import parse_json, read_json
@@ -138,7 +139,7 @@ class Next(SessionStep):
                 view = session.next()
             else:
                 given = parse_json(CandidateViews, read_json(self.candidates), self.candidates)
-                view = session.next(given.T_world_camera, given.path_length)
+                view = session.next(**given.arguments)
         self.output.result(view.to_json())
 
 

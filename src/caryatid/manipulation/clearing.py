@@ -46,7 +46,8 @@ def clear(
 
     Yields:
         A step after each view and its lift; `lift` names the removed object, which the graph holds until the
-        next view, or not if there is none.
+        next view, or not if there is none. The last one again, with `stop`, if the robot can go to no further
+        view.
 
     Raises:
         CaryatidError: A view cannot be used.
@@ -56,8 +57,9 @@ def clear(
         _repeat(explorer, step)
         views = 0 if step.lift is not None else views + 1
     while explorer.step is None or explorer.step.decision is not None:
-        if explorer.step is not None:
-            explorer.go()
+        if explorer.step is not None and (step := explorer.go()).stop is not None:
+            yield step
+            return
         explorer.look()
         views += 1
         lift, reason = _lift(explorer, goal, hands, threads, views, reachable)

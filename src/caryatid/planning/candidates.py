@@ -11,6 +11,9 @@ from scipy.spatial import KDTree
 from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.geometry.transforms import Array
 
+SAME_POSE = 1e-6
+"""Largest difference between the entries of two equal poses [1, m], after a way through float32 or JSON."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Looks:
@@ -66,12 +69,14 @@ class Candidates:
             self._looks[count] = Looks.of(chosen, self.directions)
         return self._looks[count]
 
-    def without(self, index: int, reason: str) -> Candidates:
-        """Return the views without the one at an index, which is rejected for a reason."""
+    def without(self, T_world_camera: Array, reason: str) -> Candidates:
+        """Return the views without those at a pose (4, 4), which are rejected for a reason."""
+        away = np.abs(self.T_world_camera - T_world_camera).max(axis=(1, 2), initial=0.0)
+        index = np.flatnonzero(away < SAME_POSE)
         fields = (self.T_world_camera, self.directions, self.path_length)
         poses, directions, lengths = (np.delete(of_each, index, axis=0) for of_each in fields)
         indices = None if self.indices is None else np.delete(self.indices, index)
-        rejected = self.rejected | {reason: self.rejected.get(reason, 0) + 1}
+        rejected = self.rejected | {reason: self.rejected.get(reason, 0) + len(index)}
         return Candidates(poses, directions, lengths, rejected, indices)
 
     def from_elsewhere(self, path_length: Array) -> Candidates:

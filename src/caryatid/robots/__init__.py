@@ -17,13 +17,13 @@ from caryatid.planning.posture import Posture
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
-from caryatid.robots.protocol import OwnViews, Robot, Unreachable, refusal_of, view_sphere_of, waypoints_of
+from caryatid.robots.protocol import OwnViews, Robot, Unreachable, refusal_of, view_sphere_of, way_to
 from caryatid.robots.reachability import read_reachability
 from caryatid.sensing.view_sphere import ViewSphere, direction
 
 __all__ = [
-    "OwnViews", "Posture", "Robot", "RobotMaker", "Surroundings", "Unreachable", "find_robot", "home_view",
-    "located", "offered", "refusal_of", "view_sphere_of", "waypoints_of",
+    "OwnViews", "Posture", "Robot", "RobotMaker", "Surroundings", "Unreachable", "find_robot", "go_home",
+    "located", "offered", "view_sphere_of", "way_to",
 ]  # fmt: skip
 
 HUMANOID = "humanoid"
@@ -100,8 +100,8 @@ def located(name: str) -> str:
     return f"{ARM}{Path(name.removeprefix(ARM)).absolute()}" if name.startswith(ARM) else name
 
 
-def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:
-    """Pick the first view: the reachable candidate (4, 4) nearest to `config.home` on its view sphere.
+def go_home(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> None:
+    """Move to the first view: the reachable candidate nearest to `config.home` on its view sphere.
 
     Raises:
         PlanningError: No view of the sphere can be reached.
@@ -111,8 +111,12 @@ def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:
     nearness = candidates.directions @ direction(*np.deg2rad(config.home))
     for T_world_camera in candidates.T_world_camera[np.argsort(-nearness, kind="stable")]:
         refused = refusal_of(robot, T_world_camera)
-        if refused is None:
-            return T_world_camera
+        try:
+            if refused is None:
+                robot.move_to(T_world_camera)
+                return
+        except PlanningError as error:
+            refused = Unreachable(str(error))
         rejected[refused.reason] = rejected.get(refused.reason, 0) + 1
     reasons = ", ".join(f"{reason} ({count})" for reason, count in rejected.items())
     height = f"the table top is {sphere.centre_world[2]:.2f} m above the floor, z = 0"

@@ -64,7 +64,8 @@ class ArmRobot(SimulatedRobot, OwnViews):
         confirm: Says whether the arm can go to one pose (4, 4) in the frame of the base, for exact inverse
             kinematics or a motion planner behind a coarse map. It is called for a chosen view; on False or
             None another one is chosen. Instead of True it may return the joint positions (J,), which the
-            waypoints then hold. Without it, `reachable` decides.
+            waypoints then hold. Without it, `reachable` decides. `move_to` does not ask again for the pose
+            that it accepted last.
         centre_world: Centre (3,) of its view sphere [m], or None for the middle of the table top.
         furniture: Walls that block views, or None.
         T_world_camera: Camera pose (4, 4), or None before the first move, which has path length 0.
@@ -120,7 +121,9 @@ class ArmRobot(SimulatedRobot, OwnViews):
             return Unreachable(f"{REASONS[2]}, {distance:.2f} m from the base")
         here = self._T_world_camera
         is_there = here is not None and np.array_equal(T, here)
-        if not is_there and (refused := self.confirm(T)) is not None:
+        # A sampling planner may reject at the second call what it accepted at the first.
+        is_confirmed = is_there or np.array_equal(T, self._confirmed[0])
+        if not is_confirmed and (refused := self.confirm(T)) is not None:
             return refused
         return self._posture if is_there and self._posture is not None else self._posture_of(T)
 
@@ -144,14 +147,18 @@ class ArmRobot(SimulatedRobot, OwnViews):
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
         """Ask `confirm` whether the arm can go to a candidate (4, 4); None = it can."""
-        if self._confirm is None:
-            return None
-        answer = self._confirm(transforms.invert(self.T_world_base) @ T_world_camera)
+        T_base_camera = transforms.invert(self.T_world_base) @ T_world_camera
+        answer = self._confirm is None or self._confirm(T_base_camera)
         joints = answer.copy() if isinstance(answer, np.ndarray) else None
         if joints is None and not answer:
             return Unreachable(UNCONFIRMED)
         self._confirmed = T_world_camera.copy(), joints
         return None
+
+    def _go(self, posture: Posture, T_world_camera: Array) -> float:
+        """Move there; what was confirmed held for the way from the previous pose."""
+        self._confirmed = np.zeros((4, 4)), None
+        return super()._go(posture, T_world_camera)
 
     def _posture_of(self, T_world_camera: Array) -> Posture:
         """The posture at a pose (4, 4), with the joint positions that `confirm` last returned for it."""

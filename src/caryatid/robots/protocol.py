@@ -138,16 +138,28 @@ def view_sphere_of(robot: Robot | None, proposed: ViewSphere) -> ViewSphere:
     return robot.view_sphere(proposed) if isinstance(robot, OwnViews) else proposed
 
 
-def refusal_of(robot: Robot | None, T_world_camera: Array) -> Unreachable | None:
+def refusal_of(robot: Robot, T_world_camera: Array) -> Unreachable | None:
     """Why a robot that inherits `OwnViews` refuses a candidate (4, 4) after a closer check, or None."""
-    return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None
+    try:
+        return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None
+    except PlanningError as error:
+        return Unreachable(str(error))
 
 
-def waypoints_of(robot: Robot | None, T_world_camera: Array) -> tuple[Posture, ...]:
-    """Postures of a robot on the way to a pose (4, 4); only the posture there if it gives no others."""
+def way_to(robot: Robot | None, T_world_camera: Array) -> tuple[Posture, ...] | Unreachable:
+    """Postures of a robot on the way to a candidate (4, 4), or why it refuses it after a closer check.
+
+    Only the posture there if it gives no others.
+    """
     if robot is None:
         return ()
-    if isinstance(robot, OwnViews) and (waypoints := robot.waypoints(T_world_camera)):
-        return tuple(waypoints)
-    posture = robot.solve(T_world_camera)
-    return (posture,) if isinstance(posture, Posture) else ()
+    refused = refusal_of(robot, T_world_camera)
+    if refused is not None:
+        return refused
+    try:
+        if isinstance(robot, OwnViews) and (waypoints := robot.waypoints(T_world_camera)):
+            return tuple(waypoints)
+        posture = robot.solve(T_world_camera)
+    except PlanningError as error:
+        return Unreachable(str(error))
+    return (posture,) if isinstance(posture, Posture) else posture

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 
+from caryatid.errors import PlanningError
 from caryatid.exploration import reachable_views
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
@@ -14,7 +16,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.io.json_files import Numbers
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
-from caryatid.robots import Posture, Robot
+from caryatid.robots import Robot
 from caryatid.robots.floor import STEP, FloorGrid
 from caryatid.robots.protocol import straight_lengths
 from caryatid.scene import Scene
@@ -54,17 +56,30 @@ class NextView:
         }
 
 
+REFUSED = "the robot cannot go there"
+"""Reason to reject a view that a client refuses."""
+
+
 @dataclass(frozen=True, eq=False)
 class CandidateViews:
-    """Candidate views that a robot can reach: candidates.json.
+    """Views that a robot can reach, or cannot: candidates.json.
 
     Attributes:
-        T_world_camera: Camera poses (N, 4, 4) [m]; OpenCV camera frame, world z up.
+        T_world_camera: Camera poses (N, 4, 4) [m] to choose from; OpenCV camera frame, world z up. Null for
+            those that the session's robot reaches.
         path_length: Path length (N,) [m] to each, or null for straight lines.
+        refused: Camera poses (M, 4, 4) [m] to which the robot cannot go after all, or null for none.
     """
 
-    T_world_camera: Annotated[Array, Numbers(-1, 4, 4)]
+    T_world_camera: Annotated[Array, Numbers(-1, 4, 4)] | None = None
     path_length: Annotated[Array, Numbers(-1)] | None = None
+    refused: Annotated[Array, Numbers(-1, 4, 4)] | None = None
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `Session.next`."""
+        refused = () if self.refused is None else self.refused
+        return {"candidates": self.T_world_camera, "path_length": self.path_length, "refused": refused}
 
 
 def table_floor(scene: Scene) -> FloorGrid:
@@ -85,7 +100,7 @@ def reached_candidates(robot: Robot, T_world_camera: Array, sphere: ViewSphere) 
     If the robot cannot hold that pose, paths are straight lines.
     """
     for T in (T_world_camera, transforms.look_at(T_world_camera[:3, 3], sphere.centre_world)):
-        if isinstance(robot.solve(T), Posture):
+        with suppress(PlanningError):
             robot.move_to(T)
             return reachable_views(robot, sphere)
     found = reachable_views(robot, sphere)

@@ -17,7 +17,7 @@ import logging
 import pickle
 import threading
 from base64 import b64encode
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -59,7 +59,7 @@ from caryatid.scene import KEPT, Scene
 from caryatid.segmentation.view_checks import described
 from caryatid.sensing.views import View
 from caryatid.sessions.captures import CameraRecord, Capture
-from caryatid.sessions.next_view import NextView, reached_candidates, table_floor
+from caryatid.sessions.next_view import REFUSED, NextView, reached_candidates, table_floor
 
 FORMAT: Final = {"format": "caryatid/session", "version": 1}
 """How session.json begins."""
@@ -415,17 +415,24 @@ class Session:
         self.scene = scene
         self._write_snapshot(scene, self._events)
 
-    def next(self, candidates: ArrayLike | None = None, path_length: ArrayLike | None = None) -> NextView:
+    def next(
+        self,
+        candidates: ArrayLike | None = None,
+        path_length: ArrayLike | None = None,
+        *,
+        refused: Iterable[ArrayLike] = (),
+    ) -> NextView:
         """Plan the next best view.
 
         Args:
             candidates: Reachable camera poses (N, 4, 4); None = those that the session's robot reaches, with
                 the table as the only obstacle.
             path_length: Path length (N,) [m] to each candidate; None = straight lines.
+            refused: Camera poses (4, 4) of earlier answers to which the robot cannot go; not with candidates.
 
         Raises:
             PlanningError: The session has no views, or no view is reachable.
-            InputError: The candidates are not poses.
+            InputError: The candidates are not poses, or refused poses are given with them.
         """
         sphere, robot = self.scene.sphere, None
         if sphere is None:
@@ -439,6 +446,10 @@ class Session:
             robot = find_robot(self.beginning.robot)(place)
             sphere = view_sphere_of(robot, sphere)
             reachable = reached_candidates(robot, T_world_cameras[-1], sphere)
+        for number, T in enumerate(refused):
+            if robot is None:
+                raise InputError("refused", "is given with candidates", "omit them from the candidates")
+            reachable = reachable.without(as_rigid(T, f"refused[{number}]"), REFUSED)
         visited = sphere.direction_of(T_world_cameras)
         planner = make_planner(self.beginning.planner)
         decision = next_best_view(self.scene, robot, visited, candidates=reachable, planner=planner)

@@ -10,7 +10,7 @@ import numpy as np
 from caryatid.config import Config, NoiseModel, RobotConfig
 from caryatid.geometry.transforms import Array
 from caryatid.planning.posture import Posture
-from caryatid.robots import HUMANOID, Robot, RobotMaker, Surroundings, find_robot, home_view
+from caryatid.robots import HUMANOID, Robot, RobotMaker, Surroundings, find_robot, go_home
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.sensing.view_sphere import ViewSphere
@@ -110,7 +110,7 @@ def make_simulation(
     floor = FloorGrid.from_boxes(static_boxes(scene), config.robot, centre[:2])
     make = find_robot(robot) if isinstance(robot, str) else robot
     made = make(Surroundings(centre, floor, config))
-    made.move_to(home_view(made, ViewSphere.around(centre, config.active), config.robot))
+    go_home(made, ViewSphere.around(centre, config.active), config.robot)
     around = HumanoidBody(scene, made, config.robot).around if isinstance(made, HumanoidRobot) else None
     camera = SimulatedCamera(scene, noise, config.noise, np.random.default_rng(seed), config.sensor, around)
     return Simulation(camera, made)

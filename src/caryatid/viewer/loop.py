@@ -107,8 +107,10 @@ class LoopPage(Page):
         self.stage(None)
         explorer, truth, f1 = self._explorer, self.source.truth, None
         with self.working:
-            if explorer.step is not None:
-                explorer.go()
+            if explorer.step is not None and (step := explorer.go()).stop is not None:
+                self._put(step)
+                self.ended = step.stop
+                return self.ended
             explorer.look()
             step = explorer.plan()
             if truth is not None:
