@@ -10,11 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import SMALL, TWO_ON_A_TABLE, run_command, without_labels, without_poses
+from conftest import SMALL, TWO_ON_A_TABLE, refusal, run_command, without_labels, without_poses
+from synthetic import TABLE_TOP, model_of, simulated_scene, simulated_views
 
+from caryatid.config import SensorConfig
 from caryatid.geometry import transforms
 from caryatid.io import read_recording, write_recording
 from caryatid.sensing.views import View
+from caryatid.simulation.camera import SimulatedCamera
 from caryatid.steps import read_run
 
 BOTH = pytest.mark.parametrize("command", ["extract", "explore"])
@@ -72,6 +75,43 @@ def test_a_view_that_contradicts_earlier_ones_is_warned_of(tmp_path, views, caps
         write_recording(tmp_path / name, [*views[:2], last])
         assert run_command("extract", tmp_path / name, "--out", tmp_path / "run", "--no-report") == 0
         assert ("that earlier views saw as free" in capsys.readouterr().err) == (name == "wrong")
+
+
+def test_a_right_view_that_shares_little_with_earlier_ones_is_not_warned_of(caplog):
+    camera = SimulatedCamera(simulated_scene("hidden_stack"), sensor=SensorConfig())
+    eyes = ((-1.22372, -0.01029, 1.61741), (0.7632, 1.10154, 1.30901))
+    model_of([camera.capture(transforms.look_at(eye, (0.0, 0.0, TABLE_TOP))) for eye in eyes])
+    assert caplog.text == ""
+
+
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+GL = np.diag([1.0, -1.0, -1.0, 1.0])
+BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("misread", "says"),
+    [
+        (lambda T: T @ GL, "axes are OpenGL's"),
+        (lambda T: T @ BODY, "give the pose of the optical frame"),
+        (transforms.invert, "is the inverse, world to camera"),
+        (lambda T: Y_UP @ T, "table, the world's y axis points up"),
+        (lambda T: Y_UP @ T @ GL, "axes are OpenGL's.* and the world's y axis points up"),
+    ],
+    ids=["OpenGL", "body", "inverse", "y up", "y up, OpenGL"],
+)
+@pytest.mark.parametrize("azimuth", [180.0, 60.0])
+def test_a_pose_of_another_convention_is_named(caplog, misread, says, azimuth):
+    (view,) = simulated_views("clutter", (azimuth,))
+    model_of([view.with_pose(misread(view.pose))])
+    (message,) = caplog.messages
+    assert re.search(f"if that plane is the .*{says}", message)
+
+
+def test_a_first_pose_in_millimetres_is_refused(views):
+    T = transforms.rigid(views[0].pose[:3, :3], 1000.0 * views[0].pose[:3, 3])
+    with refusal("as if in millimetres; give T_world_camera in metres"):
+        model_of([views[0].with_pose(T)])
 
 
 def a_plane(width, height, T_world_camera, top=0.7):

@@ -366,9 +366,10 @@ class TestCommands:
     def test_grasps_must_lie_within_the_arms_reach(self, kept_run, tmp_path, capsys):
         everything = np.full((8, 8, 8, 1), 255, dtype=np.uint8)
         for name, x in (("around.npz", -4.0), ("beside.npz", 4.0)):
-            write_reachability(
-                tmp_path / name, ReachabilityMap(everything, np.array([x, -4.0, -4.0]), 1.0, 0.0)
-            )
+            T_world_base = np.eye(4)
+            T_world_base[0, 3] = x
+            known = np.array([0.0, -4.0, -4.0]), 1.0, 0.0, "gripper", T_world_base
+            write_reachability(tmp_path / name, ReachabilityMap(everything, *known))
         jaw, orders = ("--json", "--gripper", "parallel"), []
         for given in ((), ("--reach", tmp_path / "around.npz"), ("--reach", tmp_path / "beside.npz")):
             assert run_command("order", kept_run, *jaw, *given, *QUICK) == 0

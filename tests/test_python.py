@@ -8,6 +8,7 @@ import trimesh
 from conftest import refusal
 
 import caryatid as ct
+from caryatid.manipulation.order import plan_order
 
 N3 = np.zeros((20, 3))
 NO_RNG = {"config": ct.Config().fit, "rng": 0}
@@ -65,6 +66,11 @@ def table():
         ("rng", lambda *_: ct.fit(N3, N3, **NO_RNG)),
         ("T_world_object", lambda *_: ct.Sphere(np.eye(3), 0.1)),
         ("extents", lambda *_: ct.Box(np.eye(4), [0.1, 0.1])),
+        ("extents", lambda *_: ct.Box(np.eye(4), [1.0, 2.0, -1.0])),
+        ("extents", lambda *_: ct.Box(np.eye(4), [1.0, 2.0, np.nan])),
+        ("radius", lambda *_: ct.Sphere(np.eye(4), 0.0)),
+        ("height", lambda *_: ct.Cylinder(np.eye(4), 0.1, np.inf)),
+        ("graph", lambda *_: plan_order(ct.Scene())),
     ],
 )
 def test_a_wrong_argument_is_named(named, call, views, table):

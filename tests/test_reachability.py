@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from arms import HIGH, LIMITS, LOW, PITCH, gantry
+from arms import HIGH, LIMITS, LOW, PITCH, base_at, gantry
 
-from caryatid.config import ArmConfig
+from caryatid.cli.options import LiftingCommand
+from caryatid.config import ArmConfig, Config, GripperConfig
 from caryatid.errors import InputError
+from caryatid.robots import find_robot
+from caryatid.robots.arm import ArmRobot
 from caryatid.robots.reachability import (
     ReachabilityMap,
     read_reachability,
@@ -105,11 +110,35 @@ class TestFiles:
         assert one.read_bytes() == other.read_bytes()
         assert sorted(p.name for p in tmp_path.iterdir()) == ["one.npz", "other"]
 
+    def test_a_map_is_used_for_what_it_is(self, tmp_path):
+        rng, base, world = np.random.default_rng(0), base_at(-0.5, 0.1, 0.7, 30.0), tmp_path / "world.npz"
+        camera = sample_reachability(gantry, LIMITS, 2000, rng, CONFIG)
+        known = {"kind": "gripper", "T_world_base": base}
+        gripper = sample_reachability(gantry, LIMITS, 2000, np.random.default_rng(0), CONFIG, **known)
+        T_base_hand = gantry(np.random.default_rng(0).uniform(*LIMITS.T, (2000, len(LIMITS))))
+        np.testing.assert_array_equal(gripper(base @ T_base_hand), camera(T_base_hand))
+        write_reachability(world, gripper)
+        np.testing.assert_array_equal(read_reachability(world)(base @ T_base_hand), camera(T_base_hand))
+        with pytest.raises(InputError, match=r"world\.npz: is a map of the gripper in the world frame, but"):
+            find_robot(f"arm:{world}")
+        with pytest.raises(InputError, match="reachable: is a map of the gripper in the world frame, but"):
+            ArmRobot(gripper, base)
+        write_reachability(tmp_path / "arm.npz", camera)
+        command = LiftingCommand(gripper="parallel", reach=tmp_path / "arm.npz")
+        with pytest.raises(InputError, match=r'arm\.npz: .*kind="gripper", T_world_base=…\) makes it'):
+            command.reachable(replace(Config(), gripper=GripperConfig(kind="parallel")))
+        with pytest.raises(InputError, match="kind: 'foot' is unknown"):
+            sample_reachability(gantry, LIMITS, 10, rng, CONFIG, kind="foot")
+
     @pytest.mark.parametrize(
         ("change", "message"),
         [
             ({"format": np.array("caryatid/graph")}, "not a reachability map"),
-            ({"version": np.array(2)}, "version 2 is not supported"),
+            ({"version": np.array(1)}, r"earlier caryatid, without its kind .* and frame; sample it again"),
+            ({"version": np.array(3)}, "version 3 is not supported"),
+            ({"kind": np.array("foot")}, "not the arrays"),
+            ({"frame": np.array("world")}, "not the arrays"),
+            ({"frame": np.array("world"), "T_world_base": np.ones((4, 4))}, "T_world_base: the last row"),
             ({"cell": None}, "not the arrays"),
             ({"cell": np.array(np.nan)}, "not the arrays"),
             ({"origin_base": np.zeros(2)}, "not the arrays"),
@@ -122,7 +151,9 @@ class TestFiles:
     def test_another_content_is_refused(self, tmp_path, change, message):
         content = {
             "format": np.array("caryatid/reachability"),
-            "version": np.array(1),
+            "version": np.array(2),
+            "kind": np.array("camera"),
+            "frame": np.array("base"),
             "reached": np.ones((2, 2, 2, 3), dtype=np.uint8),
             "origin_base": np.zeros(3),
             "cell": np.array(0.1),

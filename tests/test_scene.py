@@ -103,6 +103,24 @@ def test_masks_need_no_numbers_that_last(method):
         assert numbered[0] >= f1_of(model_of(views, config).graph, "clutter") - 0.01
 
 
+@pytest.mark.parametrize("floor", [True, False], ids=["floor", "close"])
+def test_a_mask_of_the_table_is_the_table(floor, caplog):
+    views = simulated_views("tower")
+    surface = model_of(views[:1]).surface
+    views = [
+        replace(v, depth=np.where(surface.pixels_over(v, -0.02, np.inf) | floor, v.depth, 0)) for v in views
+    ]
+    numbered = [
+        replace(v, labels=np.where((v.labels == 0) & surface.pixels_over(v, -0.02, 0.02), 99, v.labels))
+        for v in views
+    ]
+    scene = model_of(numbered)
+    assert graph_text(scene.graph) == graph_text(model_of(views).graph)
+    assert "label 99 covers the table, and is taken for it" in caplog.text
+    background = [replace(v, labels=np.where(v.labels == 0, -1, v.labels)) for v in views]
+    assert graph_text(model_of(background).graph) == graph_text(scene.graph)
+
+
 def test_masks_whose_numbers_mean_nothing_are_noticed(caplog):
     views = simulated_views("clutter", noise="carmine")
     model_of(views)
@@ -174,6 +192,10 @@ def test_labels_are_those_of_the_vertices_and_of_the_table(tower):
 
 def test_why_an_edge_is_there_or_not_can_be_asked(tower):
     assert set(tower.supports.edges) == edges(tower.graph)
+    ids = [o.id for o in tower.graph.objects]
+    assert (list(tower.graph), len(tower.graph)) == (ids, len(ids))
+    assert "o1" in tower.graph
+    assert "o77" not in tower.graph
     assert "o1" in tower.explain("o1", "o2")
     assert "does not support" in tower.explain("o5", "o2")
     with pytest.raises(InputError, match="o77"):

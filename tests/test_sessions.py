@@ -452,7 +452,7 @@ UNUSABLE = {
     "no camera": (with_K(lambda K: K * [[1e-9], [1e-9], [1.0]]), "that of earlier views has"),
     "no pose": (lambda v: replace(v, T_world_camera=None), "has no camera pose"),
     "no labels": (lambda v: replace(v, labels=None), "has no labels"),
-    "millimetres": (posed(lambda T: transforms.rigid(T[:3, :3], 1e3 * T[:3, 3])), "wrong camera pose"),
+    "millimetres": (posed(lambda T: transforms.rigid(T[:3, :3], 1e3 * T[:3, 3])), "as if in millimetres"),
     "far away": (shifted(9.0, 0.0, 0.0), "none of its points are near the table"),
     "astronomical": (shifted(1e9, 0.0, 0.0), "from the world's origin"),
     "below the table": (shifted(0.0, 0.0, -1.2), "below the table top"),

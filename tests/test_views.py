@@ -52,7 +52,7 @@ def test_points_project_back_to_their_pixels_at_their_depth():
         ({"rgb": np.zeros((5, 4, 3), dtype=np.uint8)}, "rgb is 4×5, depth is 5×4"),
         ({"labels": np.zeros((4, 4), dtype=np.int32)}, "labels is 4×4, depth is 5×4"),
         ({"normals_camera": np.zeros((3, 5, 3))}, "normals_camera is 5×3"),
-        ({"labels": np.full((4, 5), -1)}, "labels exceed"),
+        ({"labels": np.full((4, 5), -2)}, "labels exceed"),
         ({"labels": np.full((4, 5), SUPPORT_LABEL)}, "labels exceed"),
     ],
 )

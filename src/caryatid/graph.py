@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -139,6 +140,15 @@ class SupportGraph(Pictured):
         raise KeyError(
             f"unknown object '{object_id}'; known objects: {', '.join(o.id for o in self.objects)}"
         )
+
+    def __contains__(self, object_id: object) -> bool:
+        return any(o.id == object_id for o in self.objects)
+
+    def __len__(self) -> int:
+        return len(self.objects)
+
+    def __iter__(self) -> Iterator[str]:
+        return (o.id for o in self.objects)
 
     @property
     def support_surface(self) -> SceneObject | None:

@@ -40,7 +40,7 @@ from caryatid.segmentation.view_checks import (
 )
 from caryatid.sensing.registration import ViewRegistration
 from caryatid.sensing.view_sphere import ViewSphere
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View, check_labels
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.support.plausibility import reconcile
 from caryatid.support.relations import Effect, explain, infer, predict_removal
@@ -342,7 +342,8 @@ class Scene(Pictured):
             if not self.views and not self.waiting:
                 check_centre(source)
         else:
-            source = replace(source, normals_world=transforms.unit(source.normals_world))
+            labels = None if source.labels is None else check_labels(source.labels, source.name)
+            source = replace(source, normals_world=transforms.unit(source.normals_world), labels=labels)
         labelled = source.labels is not None
         if self.segmentation is None and self._labelled not in (None, labelled):
             reason = f"has {'' if labelled else 'no '}labels, unlike earlier views"
@@ -394,9 +395,8 @@ class Scene(Pictured):
         if self.surface and before and self._registration and observation.view:
             # If everything it shows had changed, the pose would be wrong instead.
             explained = list(new) if set(observation.shown) - new.keys() - {0, SUPPORT_LABEL} else []
-            unexplained = observation.cloud.points_world[~np.isin(observation.labels, explained)]
-            aligned = self._registration.aligned
-            check_free(source.name, unexplained, aligned, self.surface, before, self.config)
+            unexplained = observation.cloud.select(~np.isin(observation.labels, explained))
+            check_free(unexplained, self.surface, before, self.config)
         if not named and (given or self.config.fusion.method != "sg"):
             known = self._models.objects()
             if self.config.fusion.method == "sg":  # its models have the newest view's objects alone

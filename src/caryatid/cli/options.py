@@ -281,7 +281,7 @@ class LiftingCommand:
         """Which gripper poses the arm reaches; None = all.
 
         Raises:
-            InputError: The file is broken, or there is no gripper.
+            InputError: The file is broken, not of the gripper in the world frame, or there is no gripper.
         """
         from caryatid.robots.reachability import read_reachability
 
@@ -290,4 +290,6 @@ class LiftingCommand:
         if config.gripper.kind == "none":
             reason = "is of no use without a gripper"
             raise InputError(f"--reach {self.reach}", reason, "add --gripper parallel or --gripper suction")
-        return read_reachability(self.reach)
+        reachability = read_reachability(self.reach)
+        reachability.check_use(self.reach, "gripper", "world")
+        return reachability

@@ -57,7 +57,7 @@ class CloudConfig:
     """From depth image to oriented points."""
 
     max_coordinate: Positive = 1e4
-    """Maximum depth and camera coordinate [m]; larger values mean wrong units."""
+    """Maximum depth [m]; larger values mean wrong units."""
     max_depth: Positive = 3.0
     """Readings beyond this depth are dropped [m]; the paper's working range."""
     min_depth: NotNegative = 0.1

@@ -43,6 +43,13 @@ KINDS: dict[str, type[Shape]] = {}
 """Every kind of shape by its name, as in graph.json."""
 
 
+def _check_lengths(name: str, *lengths: float) -> None:
+    """Reject lengths [m] that no solid has; plain comparisons, because fits make many shapes."""
+    for length in lengths:
+        if not 0.0 < length < math.inf:
+            raise InputError(name, f"contains {length:g}", "give lengths above 0, in metres")
+
+
 class Shape(Pictured):
     """A convex form whose pose is at its centre: a frozen dataclass of `T_world_object` and named sizes.
 
@@ -250,6 +257,7 @@ class Box(Shape):
         if np.shape(self.extents) != (3,):
             raise InputError("extents", f"has shape {np.shape(self.extents)}", "give three edge lengths [m]")
         object.__setattr__(self, "extents", np.asarray(self.extents, dtype=np.float64))
+        _check_lengths("extents", *self.extents.tolist())
 
     @classmethod
     def from_extents(cls, T_world_object: Array, extents: Array) -> Box:
@@ -316,6 +324,11 @@ class Cylinder(Shape):
     fill: ClassVar[float] = np.pi / 4.0
     spread: ClassVar[tuple[float, float, float]] = (1.0 / 16.0, 1.0 / 16.0, 1.0 / 12.0)
 
+    def __post_init__(self) -> None:
+        Shape.__post_init__(self)
+        _check_lengths("radius", self.radius)
+        _check_lengths("height", self.height)
+
     @property
     def extents(self) -> Array:
         """Full extents (3,) [m] along the object's own axes."""
@@ -376,6 +389,10 @@ class Sphere(Shape):
     parameters: ClassVar[int] = 4
     fill: ClassVar[float] = np.pi / 6.0
     spread: ClassVar[tuple[float, float, float]] = (0.05, 0.05, 0.05)
+
+    def __post_init__(self) -> None:
+        Shape.__post_init__(self)
+        _check_lengths("radius", self.radius)
 
     @property
     def extents(self) -> Array:

@@ -192,7 +192,11 @@ def _level_rotation(dataset: Dataset, config: Config) -> Array:
     near = between[int(np.argmin(between.sum(axis=1)))] <= np.deg2rad(config.surface.max_tilt)
     if 2 * int(near.sum()) < len(ups):
         reason = f"only {int(near.sum())} of {len(ups)} views agree on which way is up"
-        raise InputError(dataset.path, reason, "omit --level, and give poses in a level world frame")
+        raise InputError(
+            dataset.path,
+            reason,
+            "omit --level, and give poses of the camera's optical frame (x right, y down, z forward)",
+        )
     turn, _ = Rotation.align_vectors(transforms.UP[None], ups[near].mean(axis=0)[None])
     return transforms.rigid(turn.as_matrix(), np.zeros(3))
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from caryatid.config import Config, LiftConfig
-from caryatid.errors import InputError
+from caryatid.errors import InputError, check_type
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.graph import Grasp, SceneObject, SupportGraph, TakeStep
 from caryatid.manipulation.grasps import Blocked, find_grasp
@@ -103,6 +103,7 @@ def plan_order(
         InputError: The graph has no support surface, no objects, or more than `rehearsal.max_objects`; or
             the goal is unknown, or there are no threads.
     """
+    check_type("graph", graph, SupportGraph, "give a SupportGraph, such as scene.graph")
     if threads < 1:
         raise InputError("threads", f"{threads} is less than 1", "give the number of parallel rehearsals")
     rehearsal = _Rehearsal(graph, config or Config(), seed, threads, voxels, reachable)

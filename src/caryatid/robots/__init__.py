@@ -78,7 +78,9 @@ def find_robot(name: str) -> RobotMaker:
     if name == HUMANOID:
         return lambda around: HumanoidRobot(around.floor, around.config.robot)
     if name.startswith(ARM):
-        reachability = read_reachability(name.removeprefix(ARM))
+        file = name.removeprefix(ARM)
+        reachability = read_reachability(file)
+        reachability.check_use(file, "camera", "base")
         return lambda around: ArmRobot(
             reachability, around.T_world_base, around.config.arm, furniture=around.floor
         )

@@ -24,6 +24,7 @@ from caryatid.robots.protocol import (
     posture_at,
     straight_lengths,
 )
+from caryatid.robots.reachability import ReachabilityMap
 from caryatid.sensing.view_sphere import ViewSphere
 
 Reachable = Callable[[Array], NDArray[np.bool_]]
@@ -71,7 +72,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         T_world_camera: Camera pose (4, 4), or None before the first move, which has path length 0.
 
     Raises:
-        InputError: A pose is not a rigid transform.
+        InputError: A pose is not a rigid transform, or a map is not of the camera in the frame of the base.
     """
 
     def __init__(
@@ -85,6 +86,8 @@ class ArmRobot(SimulatedRobot, OwnViews):
         furniture: FloorGrid | None = None,
         T_world_camera: ArrayLike | None = None,
     ) -> None:
+        if isinstance(reachable, ReachabilityMap):
+            reachable.check_use("reachable", "camera", "base")
         self._reachable = reachable
         self.T_world_base = transforms.as_rigid(T_world_base, "T_world_base")
         self._config = config or ArmConfig()

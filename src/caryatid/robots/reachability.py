@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,8 +23,13 @@ from caryatid.io.staging import read_errors, write_file
 Forward = Callable[[Array], Array]
 """Forward kinematics: joints (N, J) [rad, or m] → `T_base_camera` (N, 4, 4)."""
 
-FORMAT, VERSION = "caryatid/reachability", 1
-"""The format's name in the file."""
+FORMAT, VERSION = "caryatid/reachability", 2
+"""The format's name in the file, and its version."""
+
+Held = Literal["camera", "gripper"]
+"""What an arm holds at the end of its forward kinematics."""
+Frame = Literal["base", "world"]
+"""Frame of the poses that a map is asked for."""
 
 REMEDY = "sample it again and write it with write_reachability"
 """Remedy for a broken file."""
@@ -43,15 +48,42 @@ class ReachabilityMap:
         cell: Edge of a cell [m].
         fresh: Share of the last tenth of the samples that were the first in their cell and direction [1]:
             about the share of the arm's reach that the map lacks.
+        kind: Whether it is the reach of the arm's camera, or of its gripper.
+        T_world_base: Pose (4, 4) of the base, for a map that is asked for poses in the world; None for one
+            that is asked for poses in the frame of the base.
     """
 
     reached: NDArray[np.uint8]
     origin_base: Array
     cell: float
     fresh: float
+    kind: Held = "camera"
+    T_world_base: Array | None = None
 
-    def __call__(self, T_base_camera: Array) -> NDArray[np.bool_]:
-        """Which camera poses (N, 4, 4) lie in a cell, direction and roll that was reached (N,)."""
+    @property
+    def frame(self) -> Frame:
+        """Frame of the poses that it is asked for."""
+        return "base" if self.T_world_base is None else "world"
+
+    def check_use(self, name: str | os.PathLike[str], kind: Held, frame: Frame) -> None:
+        """Reject a map of something else, or in another frame; the error uses the name.
+
+        Raises:
+            InputError: The kind or the frame is another one.
+        """
+        if (self.kind, self.frame) != (kind, frame):
+            where = {"base": "the frame of the arm's base", "world": "the world frame"}
+            pose = "" if frame == "base" else ", T_world_base=…"
+            reason = f"is a map of the {self.kind} in {where[self.frame]}"
+            wanted = f"needed is one of the {kind} in {where[frame]}"
+            remedy = f'sample_reachability(…, kind="{kind}"{pose}) makes it'
+            raise InputError(name, f"{reason}, but {wanted}", remedy)
+
+    def __call__(self, T_frame_camera: Array) -> NDArray[np.bool_]:
+        """Which poses (N, 4, 4) in `frame` lie in a cell, direction and roll that was reached (N,)."""
+        T_base_camera = T_frame_camera
+        if self.T_world_base is not None:
+            T_base_camera = transforms.invert(self.T_world_base) @ T_frame_camera
         cells = np.floor((T_base_camera[:, :3, 3] - self.origin_base) / self.cell).astype(np.intp)
         inside = np.all((cells >= 0) & (cells < self.reached.shape[:3]), axis=1)
         x, y, z = np.where(inside[:, None], cells, 0).T
@@ -65,21 +97,31 @@ def sample_reachability(
     count: int,
     rng: np.random.Generator,
     config: ArmConfig | None = None,
+    *,
+    kind: Held = "camera",
+    T_world_base: ArrayLike | None = None,
 ) -> ReachabilityMap:
-    """Map the reach of an arm's camera from postures drawn uniformly between its joint limits.
+    """Map the reach of an arm's camera or gripper from postures drawn uniformly between its joint limits.
 
     Args:
         forward: Forward kinematics up to the camera's optical frame (x right, y down, z forward): with the
             transform from hand to camera. It may return NaN for postures in collision; they are left out.
+            For a gripper, up to the frame of its grasps.
         limits: Lowest and highest value (J, 2) of each joint [rad, or m].
         count: Number of postures to draw [1]; `ReachabilityMap.fresh` says if they were enough.
         rng: Draws them.
         config: Size of cells and number of directions.
+        kind: Whether `forward` gives the pose of the camera or of the gripper.
+        T_world_base: Pose (4, 4) of the base, for a map that is asked for poses in the world frame, as
+            `order --reach` asks; None for the frame of the base, as an `ArmRobot` asks.
 
     Raises:
-        InputError: Limits, count or the result of `forward` are not valid.
+        InputError: Kind, pose, limits, count or the result of `forward` are not valid.
     """
     config = config or ArmConfig()
+    if kind not in get_args(Held):
+        raise InputError("kind", f"'{kind}' is unknown", f"choose {' or '.join(get_args(Held))}")
+    T_base = None if T_world_base is None else transforms.as_rigid(T_world_base, "T_world_base")
     bounds = np.asarray(limits, dtype=np.float64)
     if bounds.ndim != 2 or bounds.shape[1] != 2 or len(bounds) == 0 or not np.isfinite(bounds).all():
         reason = f"expected finite numbers (J, 2), not shape {bounds.shape}"
@@ -107,7 +149,8 @@ def sample_reachability(
     np.bitwise_or.at(reached, before, bits[:early])
     fresh = float((reached[last] == 0).mean()) if len(held[-1]) else 0.0
     np.bitwise_or.at(reached, last, bits[early:])
-    return ReachabilityMap(reached, low[:3].astype(np.float64) * config.cell, config.cell, fresh)
+    origin = low[:3].astype(np.float64) * config.cell
+    return ReachabilityMap(reached, origin, config.cell, fresh, kind, T_base)
 
 
 def write_reachability(path: str | os.PathLike[str], reachability: ReachabilityMap) -> None:
@@ -118,6 +161,9 @@ def write_reachability(path: str | os.PathLike[str], reachability: ReachabilityM
     """
     buffer = io.BytesIO()
     content: dict[str, Any] = {"format": FORMAT, "version": VERSION} | asdict(reachability)
+    content |= {"frame": reachability.frame}
+    if reachability.T_world_base is None:
+        del content["T_world_base"]
     np.savez_compressed(buffer, **content)
     write_file(Path(path), buffer.getvalue())
 
@@ -126,7 +172,8 @@ def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
     """Read a map.
 
     Raises:
-        InputError: The file is missing, damaged, not a map, or of another version.
+        InputError: The file is missing, damaged, not a map, or of another version, such as an older one that
+            has neither kind nor frame.
     """
     file = Path(path)
     with read_errors(file, REMEDY):
@@ -137,6 +184,9 @@ def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
         raise InputError(file, f"not a readable .npz: {error}", REMEDY) from None
     if str(held.get("format")) != FORMAT:
         raise InputError(file, f"not a reachability map, expected format '{FORMAT}'", REMEDY)
+    if np.array_equal(held.get("version", 0), 1):
+        reason = "was written by an earlier caryatid, without its kind (camera or gripper) and frame"
+        raise InputError(file, reason, REMEDY)
     if not np.array_equal(held.get("version", 0), VERSION):
         raise InputError(file, f"version {held.get('version')} is not supported, only {VERSION}", REMEDY)
     reached = held.get("reached", np.zeros(0))
@@ -144,9 +194,14 @@ def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
     for name, shape in (("origin_base", (3,)), ("cell", ()), ("fresh", ())):
         value = held.get(name, np.zeros(0))
         good &= value.shape == shape and value.dtype.kind == "f" and bool(np.isfinite(value).all())
+    kind, frame, T_world_base = (held.get(name) for name in ("kind", "frame", "T_world_base"))
+    good &= str(kind) in get_args(Held) and str(frame) == ("base" if T_world_base is None else "world")
     if not good or held["cell"] <= 0.0:
         raise InputError(file, "not the arrays of a reachability map", REMEDY)
-    return ReachabilityMap(reached, held["origin_base"], float(held["cell"]), float(held["fresh"]))
+    if T_world_base is not None:
+        T_world_base = transforms.as_rigid(T_world_base, f"{file}: T_world_base")
+    cell, fresh, held_kind = float(held["cell"]), float(held["fresh"]), cast(Held, str(kind))
+    return ReachabilityMap(reached, held["origin_base"], cell, fresh, held_kind, T_world_base)
 
 
 class _Bins:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import logging
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +22,13 @@ from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
 WHOLE = 0.1
 """A piece smaller than this share of a mask's largest body is a crumb [1]; something thin may cut a body."""
+
+
+ALONE = 0.7
+"""Share of the points on the table's plane that a mask of the table has, and share of its points there [1]; a
+flat object leaves more of the table to see."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -113,7 +123,10 @@ def observe(
         source = _with_whole_masks(source, 2.0 * config.segmentation.edge_jump)
     cloud, pixels = _points(source, config, known)
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
-    surface = _surface(cloud, given, known, UP, config, rng)
+    pose = source.T_world_camera if isinstance(source, View) else None
+    if given is not None:
+        given = _without_table(cloud, given, known, UP, config, rng)
+    surface = _surface(cloud, given, known, UP, config, rng, pose)
     apart = np.empty((0, 2), dtype=np.int32)
     if given is not None:
         labels = given
@@ -254,8 +267,46 @@ def level_transform(
     source = thinned(source, config.cloud)
     cloud, pixels = _points(source, config)
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
+    if given is not None:
+        given = _without_table(cloud, given, None, None, config, rng)
     surface = _surface(cloud, given, None, None, config, rng)
     return transforms.level_world(surface.normal_world, surface.point_world)
+
+
+def _without_table(
+    cloud: Cloud,
+    given: NDArray[np.int32],
+    known: SupportSurface | None,
+    up: Array | None,
+    config: Config,
+    rng: np.random.Generator,
+) -> NDArray[np.int32]:
+    """Labels (N,) without that of the table, if its points have one, as segmenters of whole images give it.
+
+    In a first view, labels are asked only if no other points show a table, or only a floor a storey lower.
+    """
+    surface, apart = known, copy.deepcopy(rng)  # The same view without that label gives the same scene.
+    if known is None:
+        with suppress(NoSurfaceError):
+            found = _surface(cloud, given, None, up, config, apart)
+            heights = found.height(cloud.points_world[given > 0])
+            if np.count_nonzero(heights > config.surface.storey) < config.surface.min_points:
+                return given
+        with suppress(NoSurfaceError):
+            surface = _surface(cloud, None, None, up, config, apart)
+    if surface is None:
+        return given
+    reach = config.surface.tolerance
+    on_surface = surface.over(cloud.points_world, -reach, reach, 0.0)
+    if not on_surface.any():
+        return given
+    covered = np.bincount(given[on_surface])
+    label = int(np.argmax(covered))
+    flat = covered[label] > ALONE * np.count_nonzero(given == label)
+    if label == 0 or not flat or covered[label] < ALONE * np.count_nonzero(on_surface):
+        return given
+    log.warning("%s: label %d covers the table, and is taken for it; give it 0", cloud.name, label)
+    return np.where(given == label, np.int32(0), given)
 
 
 def _surface(
@@ -265,6 +316,7 @@ def _surface(
     up: Array | None,
     config: Config,
     rng: np.random.Generator,
+    T_world_camera: Array | None = None,
 ) -> SupportSurface:
     """Find the support surface in points without a labelled object: near the known one, or anywhere."""
     loose = np.ones(len(cloud), dtype=bool) if given is None else given == 0
@@ -280,7 +332,15 @@ def _surface(
     index, (count, planes) = np.flatnonzero(loose), (20_000, 6) if known is None else (5_000, 1)
     some = cloud.select(index[:: max(1, len(index) // count)])
     try:
-        return find_support_surface(some.points_world, some.normals_world, up, config.surface, rng, planes)
+        return find_support_surface(
+            some.points_world,
+            some.normals_world,
+            up,
+            config.surface,
+            rng,
+            planes,
+            T_world_camera=T_world_camera,
+        )
     except NoSurfaceError as error:
         if known is not None:
             return known

@@ -20,6 +20,23 @@ from caryatid.sensing.views import View
 
 Mask = NDArray[np.bool_]
 
+GL = np.diag([1.0, -1.0, -1.0])
+"""Axes (3, 3) of OpenCV's camera frame in OpenGL's."""
+BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Axes (3, 3) of OpenCV's camera frame, the optical one, in the frame of a camera's body."""
+GL_AXES = (
+    "the camera axes are OpenGL's (y up, z backward) instead of OpenCV's (y down, z forward): give "
+    "T_world_camera @ np.diag([1, -1, -1, 1])"
+)
+"""A cause of a wrong camera pose, and its remedy."""
+BODY_AXES = (
+    "the pose is that of the camera's body (x forward, z up) instead of its optical frame (x right, y down, "
+    "z forward): give the pose of the optical frame"
+)
+"""A cause of a wrong camera pose, and its remedy."""
+Z_UP = "rotate the world so that its z axis points up (on the command line: --level)"
+"""Remedy for a world frame that is not level."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SupportSurface:
@@ -180,6 +197,8 @@ def find_support_surface(
     config: SurfaceConfig,
     rng: np.random.Generator,
     max_planes: int = 6,
+    *,
+    T_world_camera: Array | None = None,
 ) -> SupportSurface:
     """Find the table among the planes of a scene.
 
@@ -195,6 +214,7 @@ def find_support_surface(
         config: Tolerances and sizes.
         rng: Draws the hypotheses.
         max_planes: Maximum number of horizontal planes, largest first, among which the table is chosen.
+        T_world_camera: Reported camera pose (4, 4), with which an error says what is wrong with it; or None.
 
     Raises:
         NoSurfaceError: No plane has enough points.
@@ -216,11 +236,11 @@ def find_support_surface(
             planes.append(plane)
             left = left & (np.abs(points @ plane.normal - plane.offset) > 2.0 * config.tolerance)
     if up is None or not planes:
-        raise NoSurfaceError(f"no support surface: {_tried(scene, rng)}")
+        raise NoSurfaceError(f"no support surface: {_tried(scene, rng, T_world_camera)}")
     return _surface(points, _choose_table(planes, up, config))
 
 
-def _tried(scene: _Scene, rng: np.random.Generator) -> str:
+def _tried(scene: _Scene, rng: np.random.Generator, T_world_camera: Array | None) -> str:
     """Say why no support surface was found, and what may help."""
     points, normals, up, config = scene
     if len(points) < config.min_points:
@@ -234,7 +254,24 @@ def _tried(scene: _Scene, rng: np.random.Generator) -> str:
         return f"{tried}; show the table top"
     share, tilt = plane.inliers.mean(), np.degrees(transforms.angle_between(plane.normal, up))
     tried += f"; the largest plane, {share:.0%} of them, is tilted by {tilt:.0f}°"
-    return f"{tried}; show the table top or, if that plane is the table, use --level"
+    causes = [] if T_world_camera is None else _misread(T_world_camera, plane.normal, config)
+    return f"{tried}; show the table top or, if that plane is the table, {' or '.join(causes) or Z_UP}"
+
+
+def _misread(T_world_camera: Array, normal_world: Array, config: SurfaceConfig) -> list[str]:
+    """Conventions of a camera pose (4, 4) other than ours in which a plane's normal (3,) points up."""
+    R = T_world_camera[:3, :3]
+    normal_camera = R.T @ normal_world
+    y_up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    readings = {
+        GL_AXES: R @ GL,
+        BODY_AXES: R @ BODY,
+        "T_world_camera is the inverse, world to camera: invert it": R.T,
+        f"the world's y axis points up: {Z_UP}": y_up @ R,
+        f"{GL_AXES}, and the world's y axis points up: {Z_UP}": y_up @ R @ GL,
+    }
+    upright = np.cos(np.radians(config.max_tilt))
+    return [cause for cause, turn in readings.items() if (turn @ normal_camera)[2] > upright]
 
 
 def refitted(

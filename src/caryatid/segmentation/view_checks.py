@@ -17,18 +17,21 @@ from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 log = logging.getLogger(__name__)
 
+AWAY = 100.0
+"""Distance of a camera from the world's origin beyond which its pose is not in metres [m]: no room is larger,
+and a camera farther than 10 cm from the origin is beyond it in millimetres."""
 COARSER = 4
 """Edge of the cells in which views are compared [voxels]; wider than the point spacing of small images."""
-THROUGH = 0.2
-"""Share of a view's points above the table in space observed free that triggers a warning [1]; a twentieth
-with correct poses."""
-UNALIGNED = 0.1
-"""The same for a view that could not be registered, counting all voxels observed free [1]; a twentieth with
-correct poses, a fifth with swapped poses or mirrored images."""
+THROUGH = 0.1
+"""Share of a view's points above the table that earlier views looked through, which triggers a warning [1];
+at most 3 % with correct poses."""
+BEHIND = 2
+"""Depth to which earlier views must have looked through the surface of such a point [voxels]. A voxel of the
+surface itself is half free, and a pose that could not be registered is wrong by a voxel."""
 
 
 def check_camera(view: View, max_coordinate: float) -> None:
-    """Reject a view with an implausible camera, or with coordinates above a maximum [m].
+    """Reject a view with an implausible camera or pose, or with depth above a maximum [m].
 
     Raises:
         WrongViewError: The camera is implausible, or pose or depth are not in metres.
@@ -41,13 +44,14 @@ def check_camera(view: View, max_coordinate: float) -> None:
     if not (pinhole and wide and -width <= cx <= 2 * width and -height <= cy <= 2 * height):
         remedy = "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of this image"
         raise WrongViewError(view.name, f"K is implausible for a camera with {described(view)}", remedy)
-    far = 0.0 if view.T_world_camera is None else float(np.abs(view.T_world_camera[:3, 3]).max())
-    if far > max_coordinate:
-        reason = f"the camera is {far:.4g} m from the world's origin"
-        raise WrongViewError(view.name, reason, "give T_world_camera in metres")
+    far = 0.0 if view.T_world_camera is None else float(np.linalg.norm(view.T_world_camera[:3, 3]))
+    if far > AWAY:
+        reason = f"the camera is {far:.4g} m from the world's origin, as if in millimetres"
+        remedy = f"give T_world_camera in metres, in a world whose origin is within {AWAY:g} m"
+        raise WrongViewError(view.name, reason, remedy)
     if float(view.depth.max(initial=0.0)) > max_coordinate:
         reason = f"depth reaches {view.depth.max():.4g} m"
-        raise WrongViewError(view.name, reason, "give depth in metres")
+        raise WrongViewError(view.name, f"{reason}, as if in millimetres", "give depth in metres")
 
 
 def check_centre(view: View) -> None:
@@ -128,7 +132,8 @@ def check_place(
     voxel = np.floor((points - voxels.origin_world) / voxels.config.size).astype(np.intp)
     within = ((voxel > 0) & (voxel < np.array(voxels.hits.shape) - 1)).all(axis=1)
     if not within.any():
-        raise refused("none of its points are near the table")
+        away = np.linalg.norm(points.mean(axis=0) - surface.point_world)
+        raise refused(f"none of its points are near the table, but {away:.3g} m away")
     seen = np.zeros(np.array(voxels.hits.shape) // COARSER + 1, dtype=np.bool_)
     seen[tuple(voxels.occupied // COARSER)] = True
     common = float(seen[tuple(voxel[within].T // COARSER)].mean())
@@ -136,29 +141,27 @@ def check_place(
         raise refused(f"only {common:.0%} of its points lie on surfaces of earlier views")
 
 
-def check_free(
-    name: str, points_world: Array, aligned: bool, surface: SupportSurface, voxels: VoxelMap, config: Config
-) -> None:
-    """Warn if a view has many points above the table in space that earlier views observed as free.
+def check_free(cloud: Cloud, surface: SupportSurface, voxels: VoxelMap, config: Config) -> None:
+    """Warn if earlier views looked through many points of a view above the table, and into what is behind.
 
     Args:
-        name: Name of the view.
-        points_world: Its points (N, 3) [m] that no change explains.
-        aligned: Whether registration matched it with earlier views.
+        cloud: Points of the view that no change explains.
         surface: The support surface.
         voxels: The map of earlier views.
         config: All settings.
     """
-    points = points_world[:: max(1, len(points_world) // 20_000)]
+    some = slice(None, None, max(1, len(cloud) // 20_000))
+    points, inward = cloud.points_world[some], -voxels.config.size * cloud.normals_world[some]
     over = (points - surface.point_world) @ surface.normal_world > 2.0 * config.surface.tolerance
     over &= ((points > voxels.origin_world) & (points < voxels.end_world)).all(axis=1)
-    states = voxels.states_around(points[over]) == FREE
-    free = states.all(axis=1) if aligned else states[:, 0]
-    if free.sum() > (THROUGH if aligned else UNALIGNED) * len(free):
+    points, inward = points[over], inward[over]
+    free = [voxels.state_at(points + step * inward) == FREE for step in range(BEHIND + 1)]
+    through = np.all(free, axis=0)
+    if through.sum() > THROUGH * len(through):
         log.warning(
             "%s: %.0f%% of its points above the table are in space that earlier views saw as free; its pose "
             "is wrong, or objects were moved",
-            name, 100.0 * free.mean(),
+            cloud.name, 100.0 * through.mean(),
         )  # fmt: skip
 
 

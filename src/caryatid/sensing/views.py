@@ -31,7 +31,7 @@ class View(Pictured):
         K: Pinhole matrix (3, 3) [px].
         T_world_camera: Camera pose (4, 4), OpenCV camera frame, or None if unknown.
         rgb: Colour (H, W, 3) uint8, or None.
-        labels: Object number of each pixel (H, W), 0 = nothing, or None without segmentation. A
+        labels: Object number of each pixel (H, W), 0 or −1 = nothing, or None without segmentation. A
             stack of masks (N, H, W), boolean or scores in [0, 1], becomes such an image of segments.
         normals_camera: Surface normals (H, W, 3) in the camera frame, or None to estimate them from depth.
         name: What to call the view in messages.
@@ -86,12 +86,8 @@ class View(Pictured):
             if field == "rgb" and (image.dtype != np.uint8 or image.shape[2:] != (3,)):
                 reason = f"rgb has shape {image.shape} and type {image.dtype}"
                 raise InputError(name, reason, "give (H, W, 3) uint8, such as (255 * rgb).astype(np.uint8)")
-            if field == "labels" and image.dtype.kind == "f" and (image != np.rint(image)).any():
-                remedy = "give integers (H, W), or a stack of masks (N, H, W)"
-                raise InputError(name, "labels are not integers", remedy)
-            if field == "labels" and ((image < 0).any() or (image >= SUPPORT_LABEL).any()):
-                remedy = "number objects from 1, 0 = no object"
-                raise InputError(name, f"labels exceed 0…{SUPPORT_LABEL - 1}", remedy)
+            if field == "labels":
+                image = check_labels(image, name)
             assign(field, image.astype(dtype, copy=False))
         if self.ignored is not None:
             assign("depth", np.where(self.ignored, np.float32(0.0), depth))
@@ -155,7 +151,7 @@ class Cloud(Pictured):
     Attributes:
         points_world: (N, 3) [m].
         normals_world: Normals (N, 3) that point towards the sensor; a scene scales them to length 1.
-        labels: Object number of each point (N,), 0 = nothing, or None.
+        labels: Object number of each point (N,), 0 or −1 = nothing, or None.
         rgb: (N, 3) uint8, or None.
         viewpoint_world: Where the sensor was (3,) [m], or None.
         name: What to call the cloud in messages.
@@ -247,6 +243,23 @@ def check_intrinsics(K: Array, name: str) -> Array:
         reason = f"K has focal lengths {matrix[0, 0]:g}, {matrix[1, 1]:g}"
         raise InputError(name, reason, "give positive focal lengths in pixels")
     return matrix
+
+
+def check_labels(labels: NDArray[Any], name: str) -> NDArray[Any]:
+    """Check labels of any shape, and return them with 0 for the background, which many segmenters number −1.
+
+    Raises:
+        InputError: They are not integers, or out of range.
+    """
+    if labels.dtype.kind == "f" and (labels != np.rint(labels)).any():
+        remedy = "give integers, or for a view a stack of masks (N, H, W)"
+        raise InputError(name, "labels are not integers", remedy)
+    if not labels.size or (labels.min() >= 0 and labels.max() < SUPPORT_LABEL):
+        return labels
+    if labels.min() < -1 or labels.max() >= SUPPORT_LABEL:
+        remedy = "number objects from 1, 0 or −1 = no object"
+        raise InputError(name, f"labels exceed 0…{SUPPORT_LABEL - 1}", remedy)
+    return np.where(labels == -1, 0, labels)
 
 
 def _numbers(values: Any, dtype: DTypeLike | None, name: str) -> NDArray[Any]:
