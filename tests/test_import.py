@@ -369,6 +369,16 @@ def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views,
     assert np.allclose(before, after, atol=1e-5)
 
 
+def test_opengl_axes_are_named_before_they_are_levelled(tmp_path, views, unfit):
+    flipped = [replace(view, T_world_camera=view.pose @ np.diag([1.0, -1.0, -1.0, 1.0])) for view in views]
+    options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
+    unfit(
+        tum_folder(tmp_path, flipped),
+        *options,
+        says="look away from what they show: the camera axes are OpenGL's",
+    )
+
+
 def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, unfit):
     turned = []
     for n, view in enumerate(views):

@@ -23,6 +23,7 @@ from caryatid.io.images import BrokenImageError
 from caryatid.io.staging import StagedFolder
 from caryatid.io.video import SECOND
 from caryatid.segmentation.observation import level_transform
+from caryatid.segmentation.support_plane import GL_AXES
 from caryatid.sensing.views import View
 
 BROKEN: Final = "broken"
@@ -180,23 +181,27 @@ def _level_rotation(dataset: Dataset, config: Config) -> Array:
     Each view votes for the up direction as if it had no pose, by the largest plane that faces its camera with
     the rest of the scene in front. The direction nearest to all others wins.
     """
-    rng, found = np.random.default_rng(0), []
+    rng, found, eyes, sights = np.random.default_rng(0), [], [], []
     for view in dataset:
         with suppress(PerceptionError):
             T_level_camera = level_transform(replace(view, T_world_camera=None), config, rng)
             found.append(transforms.rotate(view.pose, T_level_camera[2, :3]))
+            eyes.append(view.pose[:3, 3])
+            # From the camera to the table along the optical axis.
+            sights.append(view.pose[:3, 2] * T_level_camera[2, 3] / max(-T_level_camera[2, 2], 0.1))
     if not found:
         raise InputError(dataset.path, "no view shows a table, which --level requires", "omit --level")
+    # Views of one table look at about the same place; with OpenGL axes, that is behind the cameras.
+    ahead, behind = (np.std(np.array(eyes) + way * np.array(sights), axis=0).max() for way in (1.0, -1.0))
+    if behind < 0.5 * ahead:
+        raise InputError(dataset.path, f"the cameras look away from what they show: {GL_AXES}")
     ups = np.stack(found)
     between = transforms.angle_between(ups[:, None], ups[None])
     near = between[int(np.argmin(between.sum(axis=1)))] <= np.deg2rad(config.surface.max_tilt)
     if 2 * int(near.sum()) < len(ups):
         reason = f"only {int(near.sum())} of {len(ups)} views agree on which way is up"
-        raise InputError(
-            dataset.path,
-            reason,
-            "omit --level, and give poses of the camera's optical frame (x right, y down, z forward)",
-        )
+        remedy = "omit --level, and give poses of the camera's optical frame (x right, y down, z forward)"
+        raise InputError(dataset.path, reason, remedy)
     turn, _ = Rotation.align_vectors(transforms.UP[None], ups[near].mean(axis=0)[None])
     return transforms.rigid(turn.as_matrix(), np.zeros(3))
 
