@@ -227,14 +227,14 @@ class Scene(Pictured):
             Id of the new object.
 
         Raises:
-            InputError: The scene has no views, the shape no possible size, or the label is not free.
+            InputError: The scene has no views, the shape is not in metres, or the label is not free.
         """
         if self.voxels is None:
             raise InputError("scene", "has no views", "add a view first")
         check_type("shape", shape, Shape, "give a Box, a Cylinder, a Sphere or a Solid")
-        if not 0.0 < shape.extents.min() <= shape.extents.max() <= self.config.cloud.max_depth:
+        if shape.extents.max() > self.config.cloud.max_depth:
             reason = f"has extents of {shape.extents.round(3).tolist()} m"
-            raise InputError("shape", reason, "give lengths above 0, in metres")
+            raise InputError("shape", reason, "give lengths in metres")
         label = self._free_label() if label is None else label
         if label in self._labels() or not 0 < label < SUPPORT_LABEL:
             remedy = f"give a number from 1 to {SUPPORT_LABEL - 1} that no other object has"
