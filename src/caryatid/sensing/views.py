@@ -246,7 +246,7 @@ def check_intrinsics(K: Array, name: str) -> Array:
 
 
 def check_labels(labels: NDArray[Any], name: str) -> NDArray[Any]:
-    """Check labels of any shape, and return them with 0 for the background, which many segmenters number −1.
+    """Check labels (...) and return them (...) with 0 for the background, which many segmenters number −1.
 
     Raises:
         InputError: They are not integers, or out of range.
