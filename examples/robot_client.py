@@ -75,6 +75,10 @@ class RobotClient:
         """The support graph, as graph.json."""
         return self._ask("GET", f"/sessions/{name}/graph")
 
+    def order(self, name: str, goal: str | None = None, **options: Any) -> dict[str, Any]:
+        """Return a safe order in which to remove all objects, or to reach one; options: hands, settings."""
+        return self._ask("POST", f"/sessions/{name}/order", {"goal": goal, **options})
+
     def take(self, name: str, object_id: str, T: Matrix | None = None) -> dict[str, Any]:
         """Report that an object was removed, or moved by a rigid transform T in the world frame."""
         report = {"object": object_id, "T": T, "number": self.session(name)["reports"]}

@@ -12,7 +12,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,9 +26,11 @@ from conftest import npy, run_command, wall_of
 
 from caryatid import service
 from caryatid.config import Config
+from caryatid.config.settings import changed_settings
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import png
+from caryatid.manipulation.order import plan_order
 from caryatid.scene import Scene
 from caryatid.service import SessionPool, check_token, make_app
 from caryatid.sessions import Session
@@ -112,6 +114,24 @@ def test_a_session_over_http_is_the_session(client, views):
     chosen = client.post("/sessions/a/next", json=reach).json()
     assert chosen["T_world_camera"] == reach["T_world_camera"][chosen["candidate"]]
     assert chosen["platform"] is None
+
+    with Session.open(client.pool.folder / "a", read_only=True) as session:
+        scene = session.scene
+        rehearsed = {"gripper": {"kind": "parallel", "seen": 0.1}, "rehearsal": {"draws": 20}}
+        config = changed_settings(Config(), rehearsed, "")
+        order = plan_order(scene.graph, config, goal="o2", hands=1, voxels=scene.voxels).to_json()
+        assert order["steps"][0]["grasp"]["seen_free"] < 1.0
+        asked = {"goal": "o2", "settings": rehearsed}
+        assert client.post("/sessions/a/order", json=asked).json() == order
+        falls = client.get("/sessions/a/effects/o1").json()
+        assert falls == [asdict(effect) for effect in scene.predict_removal("o1")]
+        why = client.get("/sessions/a/supports/o1/o2").json()
+        assert why == {"why": scene.explain("o1", "o2")}
+    for page in ("effects/o9", "supports/o1/o9"):
+        assert client.get(f"/sessions/a/{page}").status_code == 422
+    assert client.post("/sessions/a/order", json={"goal": "o9"}).status_code == 422
+    over = {"settings": {"rehearsal": {"draws": 10_000_000}}}
+    assert client.post("/sessions/a/order", json=over).status_code == 422
 
     taken = client.post("/sessions/a/reports", json={"object": "o2"})
     assert (taken.status_code, taken.json()["views"]) == (201, 2)

@@ -13,6 +13,8 @@ from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.scene import Scene
 from caryatid.sessions import Capture, Session
+from caryatid.sessions.reading import open_run
+from caryatid.steps import read_steps
 
 
 @pytest.fixture
@@ -103,6 +105,39 @@ def test_a_robot_gives_the_poses_it_reaches(folder, files, capsys, views):
     path.write_text("{}")
     assert run_command("session", "next", folder, "--candidates", path) == 1
     assert "'T_world_camera' is missing" in capsys.readouterr().err
+
+
+def test_other_commands_take_a_session_like_a_run(folder, files, capsys, tmp_path):
+    assert run_command("report", folder) == 1
+    assert "no view shows a table top yet" in capsys.readouterr().err
+    for number in range(2):
+        assert run_command("session", "add", folder, *files(number)) == 0
+    with open_run(folder) as run:
+        seen = list(read_steps(run))
+    assert [step.index for step in seen] == [0, 1]
+    with Session.open(folder) as session:
+        assert graph_text(seen[-1].graph) == graph_text(session.graph)
+        session.take("o2")
+        (tmp_path / "graph.json").write_text(graph_text(session.graph))
+
+    assert run_command("report", folder) == 0
+    page = (folder / "report.html").read_text()
+    assert "After the last view, o2 was removed: reported by the robot." in page
+    assert "1 object, 1 support after 2 views" in page
+    orders = []
+    for source in (folder, tmp_path / "graph.json"):
+        capsys.readouterr()
+        assert run_command("order", source, "--json", "--set", "rehearsal.draws=30") == 0
+        orders.append(json.loads(capsys.readouterr().out))
+    assert [step["object"] for step in orders[0]["steps"]] == ["o1"]
+    assert orders[0] == orders[1]
+    assert run_command("export", folder, "--out", tmp_path / "scene.xml") == 0
+    assert run_command("evaluate", folder, tmp_path / "scene.xml") == 0
+
+    for source, command in ((folder, "order"), (tmp_path / "graph.json", "export")):
+        capsys.readouterr()
+        assert run_command("explore", source, "--out", tmp_path / "run") == 1
+        assert f"`caryatid {command} {source}" in capsys.readouterr().err
 
 
 BAD = (

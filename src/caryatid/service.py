@@ -20,7 +20,7 @@ from dataclasses import asdict, replace
 from functools import partial, wraps
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import uvicorn
@@ -42,6 +42,8 @@ from caryatid.graph import Change
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import read_mask
 from caryatid.io.json_files import Numbers
+from caryatid.manipulation.order import plan_order
+from caryatid.runtime.parallel import cores
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.captures import CameraRecord
 from caryatid.sessions.next_view import CandidateViews
@@ -96,12 +98,16 @@ class SessionOptions(Document):
     planner: str = Field("support", description="Planner of the next view")
 
 
+Settings = Annotated[
+    dict[str, dict[str, Any]],
+    Field(description="Settings to change, as in `caryatid config --json`: stage → name → value"),
+]
+
+
 class NewSession(SessionOptions):
     """A session to create."""
 
-    settings: dict[str, dict[str, Any]] = Field(
-        {}, description="Settings to change, as in `caryatid config --json`: stage → name → value"
-    )
+    settings: Settings = {}
     ignore: Base64Bytes | None = Field(
         None,
         description="Grey PNG of pixels to ignore in every view, such as the robot's arm; 0 = keep",
@@ -208,6 +214,44 @@ class NextAnswer(Document):
     score: float = Field(description="c = s − h, eq. 3")
     why: str = Field(description="Reason in one sentence")
     stop: str | None = Field(description="Why another view may not be worth its path, or null")
+
+
+class NewOrder(Document):
+    """A removal order to plan."""
+
+    goal: str | None = Field(None, description="Id of the object to reach; null = remove all")
+    hands: Literal[1, 2] = Field(1, description="With 2, one may hold an object while the other lifts one")
+    settings: Settings = {}
+
+
+class Lift(Document):
+    """An object to remove."""
+
+    object: str = Field(description="Its id")
+    hold: list[str] = Field(description="Objects that the other hand holds meanwhile")
+    safe: bool = Field(description="Whether the risk is at most `rehearsal.risk`")
+    risk: float = Field(description="Probability that another object moves")
+    probability: float = Field(description="Probability that no other object moves")
+    why: str = Field(description="Reason in one sentence")
+    grasp: dict[str, Any] | None = Field(
+        None, description="T_world_gripper and width [m]; null unless `gripper.kind` is set"
+    )
+
+
+class OrderAnswer(Document):
+    """A removal order."""
+
+    steps: list[Lift] = Field(description="Objects to remove, in this order")
+    safe: bool = Field(description="Whether every step is safe")
+    refusal: str | None = Field(description="Why no order is safe, or null")
+
+
+class EffectAnswer(Document):
+    """An object that moves when another one is removed."""
+
+    object_id: str = Field(description="Its id")
+    why: str = Field(description="What it loses")
+    probability: float = Field(description="Probability that it moves")
 
 
 class SessionPool:
@@ -446,6 +490,29 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     def choose_next_view(name: SessionName, given: CandidateViews) -> Any:
         """Plan the next best view among poses that your robot can reach, or without those that it cannot."""
         return pool.session(name).next(**given.arguments).to_json()
+
+    @app.post("/sessions/{name}/order", response_model=OrderAnswer, response_model_exclude_unset=True)
+    @queued
+    def order_removals(name: SessionName, given: NewOrder) -> Any:
+        """Plan a safe order in which to remove all objects, or to reach one; each lift is rehearsed."""
+        scene = pool.session(name).scene
+        config = changed_settings(scene.config, given.settings, "settings")
+        _check_limits(pool.config, config)
+        known: dict[str, Any] = {"goal": given.goal, "hands": given.hands}
+        known |= {"seed": scene.seed, "voxels": scene.voxels}
+        return plan_order(scene.graph, config, threads=cores(), **known).to_json()
+
+    @app.get("/sessions/{name}/effects/{object_id}", response_model=list[EffectAnswer])
+    @queued
+    def predict_removal(name: SessionName, object_id: str) -> Any:
+        """Predict which objects move when one is removed."""
+        return [asdict(effect) for effect in pool.session(name).scene.predict_removal(object_id)]
+
+    @app.get("/sessions/{name}/supports/{supporter}/{supported}")
+    @queued
+    def explain_support(name: SessionName, supporter: str, supported: str) -> dict[str, str]:
+        """Explain why one object supports another, or why not."""
+        return {"why": pool.session(name).scene.explain(supporter, supported)}
 
 
 class Gate:

@@ -27,7 +27,7 @@ from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import Camera
 from caryatid.simulation.scenes import is_builtin, load_scene
 from caryatid.simulation.setup import make_simulation
-from caryatid.steps import is_run
+from caryatid.steps import is_run, is_session
 
 log = logging.getLogger(__name__)
 
@@ -221,11 +221,19 @@ def extract(
 
 
 def _check_no_run(source: str) -> None:
-    """Reject a run folder, unless a built-in scene has its name."""
-    if not is_builtin(source) and is_run(Path(source)):
+    """Reject a run, a session and a graph.json, unless a built-in scene has its name."""
+    path = Path(source)
+    if path.suffix == ".json" and path.is_file():
+        remedy = (
+            f"plan lifts with `caryatid order {source}`, or make it a scene with `caryatid export {source}`"
+        )
+        raise InputError(source, "is a graph, not a scene or recording", remedy)
+    if not is_builtin(source) and (is_run(path) or is_session(path)):
         view, score, order = (f"`caryatid {command} {source}`" for command in ("view", "evaluate", "order"))
         remedy = f"view it with {view}, score it with {score}, or plan lifts with {order}"
-        raise InputError(source, "is a run, not a scene or recording", remedy)
+        raise InputError(
+            source, f"is a {'run' if is_run(path) else 'session'}, not a scene or recording", remedy
+        )
 
 
 def _ignoring(frame: Frame, ignore: Path, max_pixels: int) -> Frame:

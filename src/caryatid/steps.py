@@ -247,10 +247,13 @@ def read_run(folder: str | Path) -> Run:
     Raises:
         InputError: It is not a run folder, or a file in it is missing or broken.
     """
-    folder, remedy = Path(folder), "give a run folder, as written by explore, extract or clear"
+    folder = Path(folder)
+    remedy = "give a run folder, as written by explore, extract or clear, or a session"
     if not _exists(folder):
-        raise InputError(folder, "no such folder", remedy)
+        raise InputError(folder, "not a folder" if folder.exists() else "no such folder", remedy)
     path = folder / "run.json"
+    if not path.exists():
+        raise InputError(folder, "not a run or session", remedy)
     record = read_json(path, remedy)
     file = parse_json(_RunFile, record, path, AGAIN)
     if file.scores and len(file.scores) != file.views:
@@ -288,6 +291,11 @@ def is_run(folder: Path) -> bool:
         return _exists(folder) and read_json(folder / "run.json").get("format") == FORMAT
     except InputError:
         return False
+
+
+def is_session(folder: Path) -> bool:
+    """Whether a folder is a session, which other commands than `caryatid session` read as a run."""
+    return (folder / "session.json").is_file()
 
 
 def _exists(folder: Path) -> bool:

@@ -82,16 +82,19 @@ class Evaluate(options.Command):
     """
 
     run: options.RunPath
-    """Run folder."""
+    """Run folder or session."""
     truth: Annotated[str | None, tyro.conf.Positional, options.shown("[GT]", "the run's source")] = None
     """Scene (built-in name, scene.xml or its folder), or a recording with masks and gt.json."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
         from caryatid.evaluation.truths import evaluate_run
+        from caryatid.sessions.reading import open_run
 
         output = self.output
-        views = [{"view": n} | score.to_json() for n, score in enumerate(evaluate_run(self.run, self.truth))]
+        with open_run(self.run) as run:
+            scores = evaluate_run(run, self.truth)
+        views = [{"view": n} | score.to_json() for n, score in enumerate(scores)]
         columns = {
             "precision": "precision", "recall": "recall", "f1": "F1", "edge_precision": "edge\nprecision",
             "edge_recall": "edge\nrecall", "mean_iou": "mean\nIoU", "brier": "Brier\nscore",
@@ -119,20 +122,21 @@ class OrderCommand(options.LiftingCommand, options.ComputingCommand):
 
     settings: options.Modelling = options.Modelling()
     run: options.RunPath
-    """Run folder."""
+    """Run folder, session, or graph.json."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
         from caryatid.manipulation.order import plan_order
         from caryatid.runtime.parallel import cores
-        from caryatid.steps import read_run
+        from caryatid.sessions.reading import read_model
         from caryatid.viz.tables import order_table
 
         config = self.settings.read(self.lift_settings())
-        graph, reachable = read_run(self.run).graph, self.reachable(config)
+        graph, voxels = read_model(self.run)
         known: dict[str, Any] = {"goal": self.goal, "hands": self.hands, "seed": self.settings.seed}
+        known |= {"voxels": voxels, "reachable": self.reachable(config)}
         with self.output.working("rehearsing"):
-            order = plan_order(graph, config, threads=cores(), reachable=reachable, **known)
+            order = plan_order(graph, config, threads=cores(), **known)
         outcome = "a safe order" if order.safe else "no safe order"
         goal = f" to reach {self.goal}" if self.goal else ""
         steps = order_table(order)
@@ -151,7 +155,7 @@ class ReportCommand(options.Command):
     """
 
     run: options.RunPath
-    """Run folder; its report.html is replaced."""
+    """Run folder or session; its report.html is replaced."""
     pdf: Annotated[Path | None, options.shown("FILE.pdf")] = None
     """Also write a PDF (A4); replaces an existing file."""
 
@@ -172,7 +176,7 @@ class Export(options.Command):
 
     settings: options.Settings = options.Settings()
     run: options.RunPath
-    """Run folder, or a graph.json."""
+    """Run folder, session, or graph.json."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """File to write: .xml (mjcf), .urdf, .glb, .gltf, .graphml, .dot or .gv; replaces an existing file."""
     format: Annotated[
@@ -182,45 +186,45 @@ class Export(options.Command):
 
     def __call__(self) -> None:
         from caryatid.exports import export_graph, format_of
-        from caryatid.io.graph_json import read_graph
-        from caryatid.steps import read_run
+        from caryatid.sessions.reading import read_model
         from caryatid.viz.tables import census
 
         config, format_ = self.settings.read(), format_of(self.out, self.format)
-        graph = read_graph(self.run) if self.run.suffix == ".json" else read_run(self.run).graph
+        graph, _ = read_model(self.run)
         export_graph(graph, self.out, config.export)
         self.output.result({"file": str(self.out), "format": format_}, "")
         self.output.say(f"{self.out}: {format_}, {census(graph)}")
 
 
 def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
-    """Draw the report of a run folder; write its report.html, and a PDF if asked for; return their paths.
+    """Draw the report of a run or session; write its report.html, and a PDF if asked for; return their paths.
 
     Raises:
-        InputError: It is not a run, a file in it is broken, or a file cannot be written; an existing
-            report.html then remains unchanged.
+        InputError: It is neither a run nor a session, a file in it is broken, or a file cannot be written;
+            an existing report.html then remains unchanged.
     """
     from caryatid.io.staging import write_file
-    from caryatid.steps import read_config, read_run, read_steps
+    from caryatid.sessions.reading import open_run
+    from caryatid.steps import read_config, read_steps
     from caryatid.viz.pdf import render_pdf
     from caryatid.viz.report import make_report, read_lifts, render_html
 
-    run = read_run(folder)
-    config, record = read_config(run), run.record
-    settings = {"source": record["source"], "seed": record["seed"]} | record["options"]
-    settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
-    made_by = f"caryatid {record.get('versions', {}).get('caryatid', '')}".rstrip()
-    about = [record.get("conditions"), made_by, record.get("date", "")[:16].replace("T", " ")]
-    report = make_report(
-        Path(record["source"]).name,
-        read_steps(run),
-        about=" · ".join(filter(None, about)),
-        settings=settings,
-        scores=record.get("scores", ()),
-        strip=read_lifts(folder),
-        warnings=record.get("warnings", ()),
-        config=config.report,
-    )
+    with open_run(folder) as run:
+        config, record = read_config(run), run.record
+        settings = {"source": record["source"], "seed": record["seed"]} | record["options"]
+        settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
+        made_by = f"caryatid {record.get('versions', {}).get('caryatid', '')}".rstrip()
+        about = [record.get("conditions"), made_by, record.get("date", "")[:16].replace("T", " ")]
+        report = make_report(
+            Path(record["source"]).name,
+            read_steps(run),
+            about=" · ".join(filter(None, about)),
+            settings=settings,
+            scores=record.get("scores", ()),
+            strip=read_lifts(folder),
+            warnings=record.get("warnings", ()),
+            config=config.report,
+        )
     files = {} if pdf is None else {pdf: render_pdf(report)}
     files[folder / "report.html"] = render_html(report).encode()
     for path, content in files.items():

@@ -146,7 +146,7 @@ class View(options.ExploringCommand):
     """Show a finished run in the browser, or explore a scene or recording interactively.
 
     SOURCE is one of:
-      a run folder written by explore, extract or clear; it is not modified
+      a run folder written by explore, extract or clear, or a session; it is not modified
       a built-in scene, an MJCF scene or a recording, as for explore
 
     By default, only this machine can open the page. The page works offline; Ctrl-C closes it.
@@ -158,7 +158,7 @@ class View(options.ExploringCommand):
     """
 
     source: options.SourceName
-    """Run, scene or recording."""
+    """Run, session, scene or recording."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen on; with any but 127.0.0.1, other machines can open the page by its full address."""
     port: options.Port = PORT
@@ -167,12 +167,13 @@ class View(options.ExploringCommand):
     """Print the address of the page, but do not open a browser."""
 
     def __call__(self) -> None:
-        from caryatid.steps import is_run
+        from caryatid.steps import is_run, is_session
 
-        config, output = self.config(), self.output
+        config, output, path = self.config(), self.output, Path(self.source)
+        finished = is_run(path) or is_session(path)
         # The page shares the interpreter with the loop: a tenth of Python's interval lets it answer at once.
         sys.setswitchinterval(0.0005)
-        with closing(self._open_run() if is_run(Path(self.source)) else self._open_loop(config)) as page:
+        with closing(self._open_run(path) if finished else self._open_loop(config)) as page:
             output.result({"address": page.url, "source": self.source}, "")
             output.say(f"{self.source} at {page.url}")
             output.say("press Ctrl-C to quit")
@@ -180,16 +181,17 @@ class View(options.ExploringCommand):
                 webbrowser.open(page.url)
             wait_for_interrupt()
 
-    def _open_run(self) -> Page:
-        from caryatid.steps import read_config, read_run, read_steps
+    def _open_run(self, folder: Path) -> Page:
+        from caryatid.sessions.reading import open_run
+        from caryatid.steps import read_config, read_steps
         from caryatid.viewer.page import Page
 
-        run = read_run(self.source)
-        steps, scores = read_steps(run), [score["f1"] for score in run.record.get("scores", ())]
-        title = f"caryatid: {run.folder.name}"
-        page = Page(title, read_config(run).support, host=self.host, port=self.port)
-        for step in steps:
-            page.add(step, scores[step.index] if scores else None)
+        with open_run(folder) as run:
+            steps, scores = read_steps(run), [score["f1"] for score in run.record.get("scores", ())]
+            title = f"caryatid: {run.folder.name}"
+            page = Page(title, read_config(run).support, host=self.host, port=self.port)
+            for step in steps:
+                page.add(step, scores[step.index] if scores else None)
         return page
 
     def _open_loop(self, config: Config) -> Page:

@@ -13,7 +13,7 @@ from caryatid.io.datasets import find_sample
 from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, load_scene
 from caryatid.simulation.truth import GroundTruth, ground_truth, read_truth
 from caryatid.simulation.world import SimulatedScene, table_centre, true_shapes
-from caryatid.steps import read_run
+from caryatid.steps import Run, read_run
 
 log = logging.getLogger(__name__)
 
@@ -45,14 +45,14 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
 
 
 def evaluate_run(
-    run_folder: str | Path, truth: str | Path | None = None, config: EvaluationConfig | None = None
+    run_folder: str | Path | Run, truth: str | Path | None = None, config: EvaluationConfig | None = None
 ) -> tuple[Score, ...]:
     """Score every view of a run, in order, as `caryatid evaluate RUN [GT]` does.
 
     Warn if no object of the last view matches: the truth is probably of something else.
 
     Args:
-        run_folder: A run.
+        run_folder: The folder of a run, or the run as read.
         truth: A built-in scene; an MJCF file or scene folder, with `gt.json` beside it or else compared with
             physics; or a recording with masks and `gt.json`. None = the run's own source.
         config: Minimum IoU, tolerance of the table's height, points per pair.
@@ -60,7 +60,7 @@ def evaluate_run(
     Raises:
         InputError: The run or the truth is missing or broken, or they do not fit each other.
     """
-    run = read_run(run_folder)
+    run = run_folder if isinstance(run_folder, Run) else read_run(run_folder)
     source = str(run.record["source"] if truth is None else truth)
     folder = find_sample(source)
     if is_builtin(source) or (folder / SCENE_FILE).is_file() or folder.suffix == ".xml":
@@ -84,6 +84,6 @@ def evaluate_run(
         raise InputError(source, why, remedy)
     if not scores[-1].ious and len(run.views[-1].graph.objects) > 1:
         log.warning(
-            "%s: none of its objects matches one of %s; give the ground truth of this run", run_folder, source
+            "%s: none of its objects matches one of %s; give the ground truth of this run", run.folder, source
         )
     return tuple(scores)

@@ -33,8 +33,15 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Base64Bytes
 
 from caryatid.config import Config, SegmentationMethod
-from caryatid.errors import InputError, PlanningError
-from caryatid.exploration import given_candidates, next_best_view, reason_to_stop, used_up
+from caryatid.errors import InputError, NoSurfaceError, PlanningError
+from caryatid.exploration import (
+    Explorer,
+    Step,
+    given_candidates,
+    next_best_view,
+    reason_to_stop,
+    used_up,
+)
 from caryatid.geometry.transforms import Array, as_rigid
 from caryatid.graph import Change, SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
@@ -461,6 +468,31 @@ class Session:
         stop = used_up(len(self._events) - max(reports, default=0), state.config)
         stop = stop or reason_to_stop(state, self.scene.changed, planner, decision)
         return NextView(self.views, decision, stop)
+
+    def replay(self) -> Iterator[Step]:
+        """Compute the views again, and yield a step after each; the last one has the graph as it is now.
+
+        Raises:
+            InputError: No view shows a support surface, or a view is broken.
+        """
+        b, number, newest = self.beginning, 0, None
+        explorer = Explorer(config=b.settings, segmentation=b.segmentation, seed=b.seed)
+        scene = explorer.scene
+        for event in self._events:
+            if isinstance(event, Report):
+                event.apply(scene)
+                continue
+            with suppress(NoSurfaceError):  # the view is kept until a later one shows the surface
+                for step in explorer.looks(self._decoded(number)):
+                    if newest is not None:
+                        yield newest
+                    newest = step
+            number += 1
+        if newest is None:
+            raise InputError(self.path, "no view shows a table top yet", "add one that does")
+        reported = "; ".join(str(change) for change in scene.changes if change.view == scene.views)
+        stop = f"after the last view, {reported}" if reported else None
+        yield replace(newest, graph=scene.graph, cloud=scene.cloud, stop=stop)
 
     def undo(self) -> int:
         """Undo the last view, or the last report after it.
