@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import matplotlib as mpl
 import numpy as np
 import pytest
+import shapely
 from conftest import SMALL as SMALL_SENSOR
 from conftest import run_command
 from PIL import Image
@@ -234,6 +235,7 @@ def test_the_pdf_says_what_the_page_says_and_has_the_same_bytes_each_time(report
         "How it went", "F1 over views", "Removal", "Camera image", "wrong 0.50",
     ):  # fmt: skip
         assert said in text, said
+    assert "Drag to rotate" not in text
 
 
 def test_charts_need_several_views_or_scores_and_changes_are_listed(make_step):
@@ -343,6 +345,22 @@ def test_the_chosen_view_and_the_points_of_interest_are_on_the_sphere(make_step)
     assert "o1 – o2: saliency 0.62; seen once <i>" in page.text
     few = Candidates(step.candidates.T_world_camera[:5], step.candidates.directions[:5], np.ones(5), {})
     assert picture_svg(draw_sphere(replace(step, candidates=few))) != svg
+
+
+def test_no_line_runs_through_a_note_as_nothing_is_painted_behind_it():
+    svg = picture_svg(draw_graph(make_graph()))
+    words = [
+        shapely.box(x - 9.0, y - 8.0, x + 9.0, y)
+        for x, y in re.findall(r'font-size: 12px[^>]* x="([\d.]+)" y="([\d.]+)"', svg)
+        for x, y in [(float(x), float(y))]
+    ]
+    lines = [
+        shapely.LineString(np.array(re.findall(r"[\d.]+", piece), dtype=float).reshape(-1, 2))
+        for edge in re.findall(r'<g class="edge [^"]*">.*?<path d="([^"]*)"', svg, re.DOTALL)
+        for piece in re.findall(r"M[^MZ]*L[^MZ]*", edge)
+    ]
+    assert len(words) == len(make_graph().supports) <= len(lines) / 2
+    assert not any(line.intersects(word) for line in lines for word in words)
 
 
 def test_doubt_shows_in_the_graph_without_colour():
@@ -546,6 +564,19 @@ def test_the_page_answers_on_the_first_screen_and_is_short_offline_and_accessibl
     page.close()
     assert errors == []
     assert all(url.startswith(("file:", "data:", "blob:", "about:")) for url in asked)
+
+
+def test_print_has_a_still_picture_of_the_shapes_and_room_for_words(html, browser):
+    page = browser.new_page(viewport={"width": 700, "height": 1000})
+    page.set_content(html)
+    page.emulate_media(media="print")
+    assert not page.locator("iframe").is_visible()
+    assert page.locator("figure:has(iframe) svg").is_visible()
+    assert not page.get_by_text("Drag to rotate").is_visible()
+    page.evaluate("document.querySelectorAll('details').forEach(part => part.open = true)")
+    origins = page.locator("table:has(th:text-is('origin'))").first.locator("td:last-child")
+    assert min(box["width"] for box in (cell.bounding_box() for cell in origins.all())) > 100
+    page.close()
 
 
 def test_a_browser_without_3d_shows_a_message_in_place_of_the_shapes(browser):

@@ -17,7 +17,7 @@ import numpy as np
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.viz.colours import ink_on, object_colour, object_stripes
-from caryatid.viz.pictures import DOUBT, INK, PANEL, WRONG, Picture, keep_apart
+from caryatid.viz.pictures import DOUBT, INK, WRONG, Picture, keep_apart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -155,7 +155,8 @@ def draw_graph(
 
     def draw(axes: Axes) -> None:
         for support, points, word, place in zip(graph.supports, edges, words, plates_at, strict=True):
-            _put_edge(axes, support, points, word, place, marked=support.pair in marks)
+            line = _line_beside(points, plates_at, plates)
+            _put_edge(axes, support, line, word, place, marked=support.pair in marks)
         for item in graph.objects:
             at, half = corner + pitch * places[item.id], NODE / 2.0
             if item.id == table:
@@ -178,8 +179,33 @@ def _from_rim_to_rim(points: Array, support: Support, table: str | None) -> Arra
     return points
 
 
-def _put_edge(axes: Axes, support: Support, points: Array, word: str, place: Array, *, marked: bool) -> None:
-    """An arrow that passes its points (N, 2) upright, with its note."""
+def _line_beside(points: Array, centres: Array, sizes: Array) -> tuple[Array, Array]:
+    """A line that passes its points (N, 2) upright, with a gap at each note, as nothing is painted behind it.
+
+    Args:
+        points: Where it passes [px].
+        centres: Centres (E, 2) of the notes of all edges [px].
+        sizes: Their widths and heights (E, 2) [px].
+
+    Returns:
+        The rest of the line (M, 2), and whether each of its points begins a new piece (M,).
+    """
+    t = np.linspace(0.0, 1.0, 49)[:, None]
+    ease = np.hstack(
+        [t * t * (3.0 - 2.0 * t), t**3 + 1.5 * t * (1.0 - t)]
+    )  # a cubic Bézier, level in between
+    line = np.concatenate([points[:1], *(a + (b - a) * ease[1:] for a, b in pairwise(points))])
+    hidden = (np.abs(line[:, None] - centres) <= sizes / 2.0).all(axis=2).any(axis=1)
+    shown = ~hidden & (np.linalg.norm(line - line[-1], axis=1) > 12.0)  # the head needs a straight end
+    shown[-1] = True
+    gaps = np.cumsum(hidden)[shown]
+    return line[shown], np.diff(gaps, prepend=-1) > 0
+
+
+def _put_edge(
+    axes: Axes, support: Support, line: tuple[Array, Array], word: str, place: Array, *, marked: bool
+) -> None:
+    """An arrow along a line, with its note."""
     from matplotlib.patches import FancyArrowPatch
     from matplotlib.path import Path
 
@@ -187,21 +213,15 @@ def _put_edge(axes: Axes, support: Support, points: Array, word: str, place: Arr
     solid = not support.doubtful
     title = f"{support.supporter} supports {support.supported}: {support.why}".rstrip(": ")
     kind = f"edge {support.supporter} {support.supported} {'doubtful' if support.doubtful else 'sure'}"
-    corners = [points[0]]
-    for a, b in pairwise(points):
-        middle = (a[1] + b[1]) / 2.0
-        corners += [np.array([a[0], middle]), np.array([b[0], middle]), b]
-    curve = Path(corners, [Path.MOVETO, *[Path.CURVE4] * (len(corners) - 1)])
+    vertices, begins = line
+    curve = Path(vertices, np.where(begins, Path.MOVETO, Path.LINETO))
     width = max(1.4 if marked else 0.6, 2.4 * support.belief)
     arrow = FancyArrowPatch(
         path=curve, arrowstyle="-|>,head_length=0.5,head_width=0.22", mutation_scale=20.0, color=colour,
         linewidth=width, linestyle="-" if solid else (0, (3.5, 2.6)), gid=f"{kind}|{title}",
     )  # fmt: skip
     axes.add_artist(arrow)
-    plate = {"facecolor": PANEL, "edgecolor": "none", "pad": 0.8}
-    axes.text(
-        place[0], place[1], word, color=colour, fontsize=12.0, ha="center", va="center_baseline", bbox=plate
-    )
+    axes.text(place[0], place[1], word, color=colour, fontsize=12.0, ha="center", va="center_baseline")
 
 
 def _put_node(axes: Axes, item: SceneObject, at: Array, half: Array, graph: SupportGraph) -> None:

@@ -27,11 +27,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 THEME = {
-    "ink": "#1d2126", "soft": "#5d666f", "line": "#dcdfe2", "doubt": "#b4480b", "panel": "#f7f7f5",
-    "wrong": "#c01048",
+    "ink": "#1d2126", "soft": "#5d666f", "line": "#dcdfe2", "doubt": "#b4480b", "wrong": "#c01048",
 }  # fmt: skip
 """Colours that a page may replace by its own, so that drawings can be read on light and dark."""
-INK, SOFT, LINE, DOUBT, PANEL, WRONG = THEME.values()
+INK, SOFT, LINE, DOUBT, WRONG = THEME.values()
 STYLE = {
     "font.sans-serif": ["DejaVu Sans"],
     "text.color": INK,

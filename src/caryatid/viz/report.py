@@ -60,10 +60,11 @@ class Figure:
     Attributes:
         heading: Its heading, or empty.
         picture: What is drawn.
-        caption: Caption, or empty.
+        caption: Caption of the picture, or empty.
         share: Divisor of the page width: 2 = half of it.
         link: Anchor of the section it links to, or empty.
-        page: An HTML page that replaces the picture in HTML, or empty.
+        page: An HTML page that covers the picture on a screen, or empty.
+        page_caption: Caption of this page.
     """
 
     heading: str
@@ -72,6 +73,7 @@ class Figure:
     share: int = 2
     link: str = ""
     page: str = ""
+    page_caption: str = ""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -183,7 +185,9 @@ def make_report(
         sections.append(Section("Removal", text, strip))
     tables = [object_table(last.graph), support_table(last.graph)]
     sections += [Section("Objects and supports", tables=tables, folded=True), *views]
-    named = ((name, str(value)) for name, value in (settings or {}).items())
+    words = {None: "not set", True: "on", False: "off"}
+    given = (settings or {}).items()
+    named = ((name, words[v] if v is None or isinstance(v, bool) else str(v)) for name, v in given)
     source = Table.of("Source and options", ("name", "value"), named)
     sections.append(Section("Settings", tables=[source], folded=True))
     return Report(title, about, sections)
@@ -213,15 +217,16 @@ def _answer(
     supports = Figure("Support graph", picture, caption, share=1 if wide else 2)
     azimuth = _first_azimuth(step)
     solid = draw_cloud(step.cloud, graph, azimuth)
-    seen = Figure("Fused cloud", solid, "All points, with the fitted shapes.")
+    still = "All points, with the fitted shapes."
+    seen = Figure("Fused cloud", solid, still)
     if shown.view is not None:
         caption = f"View {shown.index + 1} with the final shapes; objects with pale names are not visible."
         seen = Figure("The objects", draw_image(shown.view, shown.labels, graph, width), caption)
     figures = [supports, seen] if wide else [seen, supports]
     if graph.objects:
         caption = "Drag to rotate, scroll to zoom. Arrows are visible through objects; orange: doubtful."
-        page = scene_3d_html(graph, azimuth)
-        figures.append(Figure("In 3D" if wide else "", solid, caption, share=2 if wide else 1, page=page))
+        heading, share, page = "In 3D" if wide else "", 2 if wide else 1, scene_3d_html(graph, azimuth)
+        figures.append(Figure(heading, solid, still, share, page=page, page_caption=caption))
     yield Section("Answer", text, figures if wide else figures[:2], facts)
     doubtful = doubts(graph)
     nothing = f"Nothing: all supports have a probability above {DOUBTFUL}, and all shapes fit."

@@ -17,8 +17,9 @@ from caryatid.viz.pictures import DOUBT, INK
 LETTER = 0.024
 """Height of a name plate [m]."""
 _CHECK = (
-    "<script>if (!document.createElement('canvas').getContext('webgl2')) document.body.replaceChildren("
-    "'This browser cannot show 3D: WebGL is missing or disabled.');</script>"
+    "<script>if (!document.createElement('canvas').getContext('webgl2')) {"
+    "document.body.style.background = 'white'; document.body.replaceChildren("
+    "'This browser cannot show 3D: WebGL is missing or disabled.');}</script>"
 )
 """Says so in place of the shapes where the browser cannot draw them."""
 
