@@ -250,20 +250,23 @@ def test_clouds_that_do_not_do(points, write_pcd, refused):
     assert "--label-divisor" in refused("extract", parts, names="cloud.pcd", says="none is left")
 
 
-# Sources and places that are not there
+# Sources and places that are not there, or something else
 
 
 @pytest.mark.parametrize(
     ("command", "name", "says"),
     [
-        ("explore", "nowhere", "hidden_stack, shelf"),
-        ("explore", "no where/scene.xml", "no such file or scene"),
+        ("explore", "nowhere", "`caryatid scenes` lists"),
+        ("explore", "", "a folder without scene.xml"),
+        ("explore", "table.md", "not an MJCF file"),
+        ("explore", "no where/scene.xml", "no such file, folder or built-in scene"),
         ("extract", "nowhere", "no such file"),
         ("extract", "nowhere.pcd", "missing"),
         ("extract", "of two\nlines", "no such file"),
     ],
 )
-def test_a_source_that_does_not_exist(tmp_path, refused, command, name, says):
+def test_a_source_that_is_none(tmp_path, refused, command, name, says):
+    (tmp_path / "table.md").touch()
     refused(command, tmp_path / name, names=name.replace("\n", " "), says=says)
 
 
@@ -283,7 +286,7 @@ def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
     for scored, truth, says in (
         (tmp_path / "nowhere", scene_file.parent, "no such folder"),
         (run, tmp_path / "nowhere", "no such scene or recording"),
-        (recording, scene_file.parent, "run.json: the file is missing"),
+        (recording, scene_file.parent, "not a run or session"),
         (run, recording, "gt.json: the file is missing"),
         (run, strange, "gt.json names 'ghost', which is not a body of the scene"),
         (run, tmp_path, "neither a scene nor a recording"),

@@ -360,8 +360,8 @@ class TestCommands:
         table = capsys.readouterr().out
         assert "a safe order" in table
         assert re.search(r"│ 1 │ o2 +│ – +│ 0.83 ", table)
-        assert run_command("order", kept_run, *QUICK, "--risk", "1.5") == 1
-        assert "rehearsal.risk" in capsys.readouterr().err
+        assert run_command("order", kept_run, *QUICK, "--risk", "1.5") == 2
+        assert "1.5 is not a probability from 0 to 1" in capsys.readouterr().err
 
     def test_grasps_must_lie_within_the_arms_reach(self, kept_run, tmp_path, capsys):
         everything = np.full((8, 8, 8, 1), 255, dtype=np.uint8)

@@ -96,6 +96,10 @@ def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, 
         ("juggle", "juggle"),
         ("expore tower", "Did you mean explore?"),
         ("explore tower --planner suport", "Did you mean support?"),
+        ("benchmark --suite smok", "Did you mean smoke?"),
+        ("benchmark --planner suport", "Did you mean support?"),
+        ("explore tower --noise carmin", "Did you mean carmine?"),
+        ("session new x --segmentation lables", "Did you mean labels?"),
     ],
 )
 def test_a_usage_error_is_short_and_names_the_remedy(words, said, capsys, monkeypatch):
@@ -108,8 +112,19 @@ def test_a_usage_error_is_short_and_names_the_remedy(words, said, capsys, monkey
 
 
 def test_version_prints_the_version(capsys):
-    assert run_command("--version") == 0
-    assert capsys.readouterr().out == f"caryatid {__version__}\n"
+    for word in ("--version", "-V", "version"):
+        assert run_command(word) == 0
+        assert capsys.readouterr().out == f"caryatid {__version__}\n"
+
+
+def test_help_can_be_asked_for_by_a_word(capsys):
+    texts = []
+    for words in ("--help", "help", "explore --help", "help explore"):
+        assert run_command(*words.split()) == 0
+        texts.append(capsys.readouterr().out)
+    assert texts[0] == texts[1]
+    assert "Print the version." in texts[0]
+    assert texts[2] == texts[3]
 
 
 # --json

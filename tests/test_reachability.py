@@ -145,7 +145,7 @@ class TestFiles:
             ({"reached": np.zeros((2, 2, 2, 2))}, "not the arrays"),
             ({"reached": np.zeros((2, 2, 2), dtype=np.uint8)}, "not the arrays"),
             ({"reached": np.zeros((0, 2, 2, 2), dtype=np.uint8)}, "not the arrays"),
-            ({"reached": np.array([None])}, "pickle"),
+            ({"reached": np.array([None])}, "damaged"),
         ],
     )
     def test_another_content_is_refused(self, tmp_path, change, message):

@@ -201,6 +201,8 @@ def extract(
         PerceptionError: A cloud shows no support surface.
     """
     _check_no_run(source)
+    if is_builtin(source):
+        raise InputError(source, "a scene, which has no views yet", f"use `caryatid explore {source}`")
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
     if not is_cloud(source):
         recording = open_recording(source, config, segmentation, masks, ignore, level)
@@ -224,9 +226,8 @@ def _check_no_run(source: str) -> None:
     """Reject a run, a session and a graph.json, unless a built-in scene has its name."""
     path = Path(source)
     if path.suffix == ".json" and path.is_file():
-        remedy = (
-            f"plan lifts with `caryatid order {source}`, or make it a scene with `caryatid export {source}`"
-        )
+        lifts, made = f"`caryatid order {source}`", f"`caryatid export {source} --out scene.xml`"
+        remedy = f"plan lifts with {lifts}, or make it a scene with {made}"
         raise InputError(source, "is a graph, not a scene or recording", remedy)
     if not is_builtin(source) and (is_run(path) or is_session(path)):
         view, score, order = (f"`caryatid {command} {source}`" for command in ("view", "evaluate", "order"))

@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     debug = False
     try:
-        if arguments == ["--version"]:
+        if arguments in (["--version"], ["-V"], ["version"]):
             sys.stdout.write(f"caryatid {__version__}\n")
             return 0
         from caryatid.cli.commands import read_command

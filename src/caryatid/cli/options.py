@@ -66,6 +66,17 @@ def whole_number(least: int) -> PrimitiveConstructorSpec[Any]:
     return _word("N", parse)
 
 
+def probability() -> PrimitiveConstructorSpec[Any]:
+    """A number from 0 to 1, or None if omitted; anything else is a usage error."""
+
+    def parse(word: str) -> float:
+        if not 0.0 <= float(word) <= 1.0:
+            raise ValueError(f"{word} is not a probability from 0 to 1")
+        return float(word)
+
+    return _word("P", parse)
+
+
 def _word(
     metavar: str, parse: Callable[[str], Any], choices: tuple[str, ...] | None = None
 ) -> PrimitiveConstructorSpec[Any]:
@@ -73,7 +84,7 @@ def _word(
         nargs=1,
         metavar=metavar,
         instance_from_str=lambda words: parse(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, str | int),
+        is_instance=lambda value: value is None or isinstance(value, str | int | float),
         str_from_instance=lambda value: [str(value)],
         choices=choices,
     )
@@ -270,7 +281,7 @@ class LiftingCommand:
     """Offer only lifts with a grasp on a free path; dimensions are the settings `gripper.*`."""
     reach: Annotated[Path | None, shown("FILE.npz")] = None
     """Offer only grasps within an arm's reach: a reachability map of the gripper, in the world frame."""
-    risk: Annotated[float | None, default_of("rehearsal.risk", "P")] = None
+    risk: Annotated[float | None, probability(), default_of("rehearsal.risk")] = None
     """Maximum probability that a lift moves another object."""
 
     def lift_settings(self) -> dict[str, object]:

@@ -160,12 +160,10 @@ def open_dataset(
         InputError: It does not exist, has an unknown format, or is damaged.
     """
     path = find_sample(path)
-    if not path.exists():
-        raise InputError(path, "no such file or folder", "give a recording, or `caryatid explore` a scene")
-    known = format_of(path)
+    known = format_of(path) if path.exists() else None
     if known is None:
         bags = "a bag (.bag, .mcap, .db3, or a folder with metadata.yaml)"
         remedy = f"give a BOP scene folder, {bags}, or a TUM RGB-D folder with depth.txt"
-        raise InputError(path, "unknown format", remedy)
+        raise InputError(path, "unknown format" if path.exists() else "no such file or folder", remedy)
     dataset: Dataset = known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())
     return dataset

@@ -113,8 +113,10 @@ def read_npy(array: Path | bytes, name: str = "") -> NDArray[Any]:
     try:
         content = array.read_bytes() if isinstance(array, Path) else array
         return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
-    except Exception as error:  # NumPy parses the header as Python, so a damaged one raises almost anything
-        reason = f"is not a valid .npy ({' '.join(str(error).split())})"
+    except OSError as error:
+        raise InputError(source, f"cannot be read ({error.strerror or error})", "give a .npy file") from None
+    except Exception:  # NumPy parses the header as Python, so a damaged one raises almost anything
+        reason = "is not a valid .npy of numbers"
         raise InputError(source, reason, "save it with numpy.save") from None
 
 

@@ -31,7 +31,7 @@ Held = Literal["camera", "gripper"]
 Frame = Literal["base", "world"]
 """Frame of the poses that a map is asked for."""
 
-REMEDY = "sample it again and write it with write_reachability"
+REMEDY = "give a reachability map, a file that write_reachability wrote"
 """Remedy for a broken file."""
 
 
@@ -180,8 +180,8 @@ def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
         content = file.read_bytes()
     try:
         held = dict(np.load(io.BytesIO(content), allow_pickle=False))
-    except Exception as error:  # NumPy raises many kinds of error for a damaged archive
-        raise InputError(file, f"not a readable .npz: {error}", REMEDY) from None
+    except Exception:  # NumPy raises many kinds of error for a damaged archive, and gives advice for pickles
+        raise InputError(file, "damaged, or not an .npz", REMEDY) from None
     if str(held.get("format")) != FORMAT:
         raise InputError(file, f"not a reachability map, expected format '{FORMAT}'", REMEDY)
     if np.array_equal(held.get("version", 0), 1):

@@ -140,16 +140,20 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
         return scene_from_spec(build_spec(DESIGNED[text], text), text, text, config, least=1.0)
     if match := _GENERATED.fullmatch(text):
         return generate(cast(GeneratedKind, match[1]), int(match[2]), int(match[3]), config)
-    path = Path(text)
+    path, listed = Path(text), "`caryatid scenes` lists the built-in ones"
+    if not path.exists():
+        meant = get_close_matches(text, DESIGNED, 1)
+        remedy = f"did you mean {meant[0]}? {listed}" if meant else listed
+        raise InputError(text, "no such file, folder or built-in scene", remedy)
     if path.is_dir():
         path = path / SCENE_FILE
-    if not path.exists():
-        remedy = f"give an MJCF file or the name of a built-in scene: {', '.join(list_scenes())}"
-        if meant := get_close_matches(text, DESIGNED, 1):
-            remedy = f"did you mean {meant[0]}? `caryatid scenes` lists all"
-        raise InputError(path, "no such file or scene", remedy)
-    if not path.is_file():
-        raise InputError(path, "not a file", "give an MJCF file")
+        if not path.exists():
+            remedy = f"give the folder of a scene, or of a recording (scene_camera.json, depth.txt); {listed}"
+            raise InputError(text, f"a folder without {SCENE_FILE}", remedy)
+    if path.suffix.lower() != ".xml" or not path.is_file():
+        raise InputError(
+            path, "not an MJCF file", f"give an .xml file or a folder with a {SCENE_FILE}; {listed}"
+        )
     _check_sizes(path, config or PhysicsConfig())
     try:
         with mujoco_warnings_ignored():

@@ -195,7 +195,8 @@ def _line_beside(points: Array, centres: Array, sizes: Array) -> tuple[Array, Ar
         [t * t * (3.0 - 2.0 * t), t**3 + 1.5 * t * (1.0 - t)]
     )  # a cubic Bézier, level in between
     line = np.concatenate([points[:1], *(a + (b - a) * ease[1:] for a, b in pairwise(points))])
-    hidden = (np.abs(line[:, None] - centres) <= sizes / 2.0).all(axis=2).any(axis=1)
+    beside = np.any(np.abs(line[:, None] - centres) > sizes / 2.0, axis=2)
+    hidden = ~np.all(beside, axis=1)
     shown = ~hidden & (np.linalg.norm(line - line[-1], axis=1) > 12.0)  # the head needs a straight end
     shown[-1] = True
     gaps = np.cumsum(hidden)[shown]
