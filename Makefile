@@ -19,6 +19,7 @@ $(VENV)/.installed: $(VENV)/.usable
 
 demo: $(VENV)/.usable
 	$(BIN)/caryatid demo --out demo-run
+	@echo "next, run $(BIN)/caryatid order demo-run, or $(BIN)/caryatid view clutter"
 
 test: install
 	$(BIN)/python -m pytest
