@@ -22,7 +22,7 @@ from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 FREE_WEIGHT = 0.01
 """Cost of a shape whose whole inside was seen free [m]; in proportion for a share of it."""
-BARE_SPACING = 0.005
+BARE_SPACING = 0.0065
 """Spacing of the samples on a side that count points near it [m]; a point within twice that is near one."""
 
 
