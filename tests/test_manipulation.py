@@ -351,7 +351,7 @@ class TestCommands:
             assert step.keys() == {"object", "hold", "safe", "risk", "probability", "why"}
             assert (step["safe"], step["hold"]) == (True, [])
             assert step["probability"] == 1.0 - step["risk"]
-        assert run_command("order", kept_run, "--json", "--gripper", "parallel", *QUICK) == 0
+        assert run_command("order", kept_run, "--json", "--gripper", "parallel", *QUICK) == 3
         grasps = [step["grasp"] for step in json.loads(capsys.readouterr().out)["steps"]]
         assert [np.shape(grasp["T_world_gripper"]) for grasp in grasps] == [(4, 4)]  # o1 is too wide
         assert run_command("order", kept_run, "--gripper", "claw", *QUICK) == 2
@@ -372,7 +372,7 @@ class TestCommands:
             write_reachability(tmp_path / name, ReachabilityMap(everything, *known))
         jaw, orders = ("--json", "--gripper", "parallel"), []
         for given in ((), ("--reach", tmp_path / "around.npz"), ("--reach", tmp_path / "beside.npz")):
-            assert run_command("order", kept_run, *jaw, *given, *QUICK) == 0
+            assert run_command("order", kept_run, *jaw, *given, *QUICK) == 3  # o1 is too wide
             orders.append(json.loads(capsys.readouterr().out))
         assert orders[0] == orders[1] != orders[2]
         assert orders[2]["steps"] == []
@@ -382,7 +382,7 @@ class TestCommands:
             assert said in capsys.readouterr().err
 
     def test_orders_that_cannot_be_are_errors(self, kept_run, tmp_path, capsys):
-        assert run_command("order", kept_run, "--goal", "o9", *QUICK) == 1
+        assert run_command("order", kept_run, "--goal", "o9", *QUICK) == 4
         assert "o9: is not an object of the graph; known objects: o1, o2" in capsys.readouterr().err
         assert run_command("order", tmp_path, *QUICK) == 1
         assert "run.json" in capsys.readouterr().err
@@ -438,7 +438,7 @@ class TestCommands:
             out = tmp_path / str(seen)
             command = ["clear", scene_file, "--goal", "o1", "--gripper", "suction", "--out", out, "--json"]
             command += ["--no-report", f"--set=gripper.seen={seen}"]
-            assert run_command(*command, *SMALL, *QUICK) == 0
+            assert run_command(*command, *SMALL, *QUICK) == (0 if taken else 3)
             document = json.loads(capsys.readouterr().out)
             assert [step["object"] for step in document["steps"]] == taken
             assert all(0.0 <= step["grasp"]["seen_free"] < 0.95 for step in document["steps"])
@@ -448,7 +448,7 @@ class TestCommands:
 
     def test_it_keeps_looking_while_no_lift_is_safe(self, scene_file, tmp_path, capsys):
         command = ["clear", scene_file, "--views", 6, "--set=active.effort=1", "--json", "--no-report"]
-        assert run_command(*command, "--out", tmp_path / "run", *SMALL, "--risk=0", QUICK[0], QUICK[2]) == 0
+        assert run_command(*command, "--out", tmp_path / "run", *SMALL, "--risk=0", QUICK[0], QUICK[2]) == 3
         document = json.loads(capsys.readouterr().out)
         assert (document["views"], document["steps"]) == (6, [])
         assert document["stop"].startswith("no lift is safe")
@@ -461,7 +461,7 @@ class TestCommands:
     def test_an_unknown_goal_is_an_error(self, segmentation, why, views, scene_file, tmp_path, capsys):
         command = ["clear", scene_file, "--goal", "o99", "--views", 2, "--segmentation", segmentation]
         command += ["--quiet", "--no-report", "--out", tmp_path / "run"]
-        assert run_command(*command, *SMALL, *QUICK) == 1
+        assert run_command(*command, *SMALL, *QUICK) == 4
         assert capsys.readouterr() == ("", f"error: --goal o99: {why}\n")
         assert (tmp_path / "run").exists() == (views is not None)
         assert views is None or len(read_run(tmp_path / "run").views) == views

@@ -44,6 +44,10 @@ def check_type(name: str, value: object, wanted: str | type | tuple[type, ...], 
         raise InputError(name, f"has the wrong type, {type(value).__name__}", remedy)
 
 
+class GoalError(InputError):
+    """A goal that is not among the objects."""
+
+
 class WrongViewError(InputError):
     """A view whose camera or pose cannot be correct; other views may be usable."""
 

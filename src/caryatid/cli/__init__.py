@@ -14,8 +14,12 @@ from pathlib import Path
 from typing import NoReturn
 
 from caryatid import __version__
-from caryatid.errors import in_one_line
+from caryatid.errors import GoalError, in_one_line
 
+NOT_SAFE = 3
+"""Exit status if no order is safe, or not all that was to be removed was removed without harm."""
+GOAL_NOT_FOUND = 4
+"""Exit status if the goal is not among the objects."""
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
@@ -27,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The command and its options; None takes them from the command line.
 
     Returns:
-        0 done, 1 bad input, failed work or a closed pipe, 130 interrupted.
+        0 done, 1 bad input, failed work or a closed pipe, 3 no safe order, 4 goal not found, 130 interrupted.
 
     Raises:
         SystemExit: After --help, with 0; on wrong options, with 2.
@@ -42,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         command = read_command(arguments)
         debug = command.general.debug
-        command()
+        status: int = command() or 0
         sys.stdout.flush()
     except KeyboardInterrupt as stop:
         sys.stderr.write(f"interrupted: {str(stop) or 'nothing was written'}\n")
@@ -57,8 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if debug:
             raise
         sys.stderr.write(f"error: {in_one_line(error)}\n")
-        return 1
-    return 0
+        return GOAL_NOT_FOUND if isinstance(error, GoalError) else 1
+    return status
 
 
 def _interrupted(error: BaseException | None) -> bool:

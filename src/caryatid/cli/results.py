@@ -124,7 +124,8 @@ class OrderCommand(options.LiftingCommand, options.ComputingCommand):
     run: options.RunPath
     """Run folder, session, or graph.json."""
 
-    def __call__(self) -> None:
+    def __call__(self) -> int:
+        from caryatid.cli import NOT_SAFE
         from caryatid.cli.output import table
         from caryatid.manipulation.order import plan_order
         from caryatid.runtime.parallel import cores
@@ -143,6 +144,7 @@ class OrderCommand(options.LiftingCommand, options.ComputingCommand):
         rows = [[entry.text for entry in row] for row in steps.rows]
         shown = table(f"{self.run}: {outcome}{goal}", steps.columns, rows)
         self.output.result(order.to_json(), shown, f"{order.refusal}\n" if order.refusal else "")
+        return 0 if order.safe else NOT_SAFE
 
 
 @dataclass(frozen=True, kw_only=True)

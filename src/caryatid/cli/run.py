@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from caryatid.cli import options
-from caryatid.errors import InputError
+from caryatid.errors import GoalError, InputError
 
 if TYPE_CHECKING:
     from caryatid.cli.output import Output
@@ -268,9 +268,10 @@ class Clear(options.LiftingCommand, options.ExploringCommand):
         """All settings."""
         return self.settings.read({"active.max_views": self.views} | self.lift_settings(), takes_views=True)
 
-    def __call__(self) -> None:
+    def __call__(self) -> int:
         import numpy as np
 
+        from caryatid.cli import NOT_SAFE
         from caryatid.cli.output import table
         from caryatid.exploration import Explorer
         from caryatid.graph import object_id
@@ -295,7 +296,7 @@ class Clear(options.LiftingCommand, options.ExploringCommand):
         ids = [object_id(label) for label in labels if self.segmentation != "auto" and masks is None]
         if ids and self.goal is not None and self.goal not in ids:
             reason = "is not an object of the scene"
-            raise InputError(f"--goal {self.goal}", reason, f"known objects: {', '.join(ids)}")
+            raise GoalError(f"--goal {self.goal}", reason, f"known objects: {', '.join(ids)}")
         known: dict[str, Any] = {"segmentation": self.segmentation, "seed": seed, "masks": masks}
         known |= {"planner": self.chosen_planner, "config": config}
         explorer = Explorer(camera, source.robot, **known)
@@ -332,7 +333,7 @@ class Clear(options.LiftingCommand, options.ExploringCommand):
         found = [o.id for o in last.graph.objects if o.role == "object"]
         if self.goal is not None and self.goal not in found and not lifts:
             reason = f"was not found in {count_of(last.index + 1, 'view')}"
-            raise InputError(f"--goal {self.goal}", reason, f"objects found: {', '.join(found) or 'none'}")
+            raise GoalError(f"--goal {self.goal}", reason, f"objects found: {', '.join(found) or 'none'}")
         harmed = sorted({body for lift in lifts for body in lift["disturbed"]})
         gone = {lift["object"] for lift in lifts if lift["body"] is not None}
         reached = self.goal in gone if self.goal else not hands.left
@@ -348,6 +349,7 @@ class Clear(options.LiftingCommand, options.ExploringCommand):
         title = f"{source.name}: {last.stop}; {count_of(last.index + 1, 'view')}, {outcome}"
         shown = table(title, ("", "remove", "body", "hold", "disturbed", "reason"), rows)
         output.result(document, shown)
+        return 0 if document["success"] else NOT_SAFE
 
 
 def _opening(command: Explore | View | Clear, masks: MaskSource | None) -> Callable[[Config], Source]:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from caryatid.config import Config, LiftConfig
-from caryatid.errors import InputError, check_type
+from caryatid.errors import GoalError, InputError, check_type
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.graph import Grasp, SceneObject, SupportGraph, TakeStep
 from caryatid.manipulation.grasps import Blocked, find_grasp
@@ -100,15 +100,16 @@ def plan_order(
         reachable: Which gripper poses (N, 4, 4), in the world frame, the arm reaches; None = all.
 
     Raises:
+        GoalError: The goal is not an object of the graph.
         InputError: The graph has no support surface, no objects, or more than `rehearsal.max_objects`; or
-            the goal is unknown, or there are no threads.
+            there are no threads.
     """
     check_type("graph", graph, SupportGraph, "give a SupportGraph, such as scene.graph")
     if threads < 1:
         raise InputError("threads", f"{threads} is less than 1", "give the number of parallel rehearsals")
     rehearsal = _Rehearsal(graph, config or Config(), seed, threads, voxels, reachable)
     if goal is not None and goal not in rehearsal.ids:
-        raise InputError(goal, "is not an object of the graph", f"known objects: {', '.join(rehearsal.ids)}")
+        raise GoalError(goal, "is not an object of the graph", f"known objects: {', '.join(rehearsal.ids)}")
     found: list[TakeStep] = []
     refusal = ""
     while len(found) != steps and (left := rehearsal.left()) and (goal is None or goal in left):
