@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import tomllib
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -168,7 +170,7 @@ def test_without_a_command_it_shows_how_to_start(capsys):
 
 
 def test_a_run_is_scored_against_the_ground_truth_of_its_source_or_of_a_place(
-    tmp_path, kept_run, scene_file, capsys
+    tmp_path, kept_run, scene_file, capsys, monkeypatch
 ):
     def scored(*arguments):
         capsys.readouterr()
@@ -176,10 +178,18 @@ def test_a_run_is_scored_against_the_ground_truth_of_its_source_or_of_a_place(
         return capsys.readouterr().out
 
     assert scored(kept_run) == scored(kept_run, scene_file.parent) == scored(kept_run, scene_file)
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(scene_file.parent, "sub/two")
+    words = ("--views", 1, "--quiet", "--no-report", *SMALL)
+    assert run_command("explore", "sub/two", "--out", "sub/run", *words) == 0
+    Path("sub").rename("moved")
+    assert scored("moved/run") == scored("moved/run", scene_file)
     assert run_command("extract", "sample-recording", "--out", tmp_path / "run", "--no-report") == 0
     assert scored(tmp_path / "run") == scored(tmp_path / "run", "sample-recording")
-    (warning,) = json.loads(scored(tmp_path / "run", "tower"))["warnings"]
+    strange = json.loads(scored(tmp_path / "run", "tower"))
+    (warning,) = strange["warnings"]
     assert "matches one of tower" in warning
+    assert strange["views"][-1]["brier"] is strange["views"][-1]["average_precision"] is None
     views = json.loads(scored(kept_run))["views"]
     assert [v["view"] for v in views] == [0, 1]
     keys = {"view", "precision", "recall", "f1", "edge_precision", "edge_recall", "mean_iou", "brier"}
@@ -234,6 +244,20 @@ def test_config_writes_settings_that_read_back_as_they_are(tmp_path, capsys):
     assert run_command("config", "--json", *words) == 0
     settings = json.loads(capsys.readouterr().out)
     assert (settings["fusion"]["method"], settings["fit"]["hypotheses"]) == ("sg", 78)
+
+
+def test_with_a_goal_it_says_what_moves_without_it(tmp_path, scene_file, capsys):
+    words = ("explore", scene_file, "--goal", "o1", "--noise", "none", "--out", tmp_path / "run", *SMALL)
+    assert run_command(*words) == 0
+    last = [line for line in capsys.readouterr().err.splitlines() if line.startswith("  without o1: ")][-1]
+    assert re.fullmatch(r"  without o1: o2 moves \(1\.00\), nothing else moves \(0\.9\d\)", last)
+    assert last.partition(": ")[2].capitalize() in (tmp_path / "run/report.html").read_text()
+    assert run_command(*words, "--json", "--no-report") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["stop"] == "whether each object moves without o1 is known with probability 0.95"
+    (effect,) = document["removal"]["moving"]
+    assert (effect["object"], effect["probability"]) == ("o2", 1.0)
+    assert 0.9 < document["removal"]["rest"] < 1.0
 
 
 def test_without_early_stop_it_looks_until_the_views_are_used_up(tmp_path, recording):

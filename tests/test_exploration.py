@@ -57,10 +57,13 @@ def test_it_ends_where_no_view_promises_more_than_its_path_costs():
 def test_with_a_goal_it_ends_once_it_is_known_what_that_moves():
     alone, steps = len(exploration(LONG)), exploration(LONG, goal="o5")
     assert len(steps) < alone
-    assert steps[-1].stop == "what moves without o5 is known with probability 0.95"
+    assert steps[-1].stop == "whether each object moves without o5 is known with probability 0.95"
+    assert steps[-1].removal.object_id == "o5"
+    assert steps[-1].removal.effects == steps[-1].removal.moving
     never = exploration(LONG, goal="o99")
     assert len(never) == alone
     assert never[-1].stop.endswith("; o99 was not found")
+    assert never[-1].removal is None
     sure = exploration(LONG, until=0.6)[-1]
     assert (sure.index, sure.stop) == (1, "every support is known with probability 0.6")
     with pytest.raises(InputError, match=r"0.5 is not above 0.5 and at most 1"):

@@ -404,6 +404,21 @@ class TestCommands:
         assert [i for i in lifts if i] == ["o2", "o1"]
         assert [o.role for o in run.graph.objects] == ["support_surface"]
 
+    def test_each_lift_is_said_once_and_what_is_gone_is_not_missed(self, scene_file, tmp_path, capsys):
+        out = tmp_path / "run"
+        assert run_command("clear", scene_file, "--goal", "o1", "--out", out, *SMALL, *QUICK) == 0
+        said = capsys.readouterr().err.splitlines()
+        first, last = (said.index(f"  removed {i}: disturbed nothing in 2 rehearsals") for i in ("o2", "o1"))
+        after = [line for line in said[first + 1 : last] if "o2" in line]
+        assert after == []
+        assert not any("gone" in line or "reported" in line for line in said)
+        assert said[last - 1].split(":")[0] == f"view {len(read_run(out).views)}, after its lift"
+        assert "was removed" not in (out / "report.html").read_text()
+        assert run_command("evaluate", out, "--json") == 0
+        *_, before, cleared = json.loads(capsys.readouterr().out)["views"]
+        assert before["recall"] == cleared["recall"] == 1.0
+        assert cleared["brier"] is cleared["average_precision"] is cleared["mean_iou"] is None
+
     def test_it_looks_at_the_goal_before_it_takes_what_is_in_the_way(self):
         table = simulate("bridge")
         explorer = Explorer(table.camera, table.robot, config=CONFIG)
@@ -458,10 +473,11 @@ class TestCommands:
         [("labels", "is not an object of the scene; known objects: o1, o2", None),
          ("auto", "was not found in 2 views; objects found: o1", 2)],
     )  # fmt: skip
-    def test_an_unknown_goal_is_an_error(self, segmentation, why, views, scene_file, tmp_path, capsys):
-        command = ["clear", scene_file, "--goal", "o99", "--views", 2, "--segmentation", segmentation]
-        command += ["--quiet", "--no-report", "--out", tmp_path / "run"]
-        assert run_command(*command, *SMALL, *QUICK) == 4
+    @pytest.mark.parametrize("name", ["explore", "clear"])
+    def test_an_unknown_goal_is_an_error(self, name, segmentation, why, views, scene_file, tmp_path, capsys):
+        command = [name, scene_file, "--goal", "o99", "--views", 2, "--segmentation", segmentation]
+        command += ["--quiet", "--no-report", "--out", tmp_path / "run", *(QUICK * (name == "clear"))]
+        assert run_command(*command, *SMALL) == 4
         assert capsys.readouterr() == ("", f"error: --goal o99: {why}\n")
         assert (tmp_path / "run").exists() == (views is not None)
         assert views is None or len(read_run(tmp_path / "run").views) == views

@@ -32,7 +32,7 @@ from caryatid.planning.expected_visibility import (
     surface_samples,
     visibility,
 )
-from caryatid.planning.goals import settled
+from caryatid.planning.goals import predict_goal, settled
 from caryatid.planning.planners import BUILT_IN, VOLUMETRIC, make_planner
 from caryatid.planning.planners.baselines import STOPS, RandomPlanner
 from caryatid.planning.planners.volumetric import image_rays, ray_information
@@ -48,7 +48,7 @@ from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.robots.recording import RecordingRobot
 from caryatid.sensing.view_sphere import ViewSphere, direction
 from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
-from caryatid.support.relations import Effect
+from caryatid.support.relations import Effect, Removal
 
 CONFIG = ActiveVisionConfig()
 COUNT = CONFIG.look_directions
@@ -401,14 +401,20 @@ def test_a_goal_is_settled_once_it_is_known_what_moves_and_that_nothing_unseen_r
     probability, unseen, expected, monkeypatch
 ):
     moves = {"o1": (Effect("o2", "", probability),), "o2": ()}
-    monkeypatch.setattr("caryatid.planning.goals.predict_removal", lambda _, goal, __: moves[goal])
+    monkeypatch.setattr(
+        "caryatid.planning.goals.removal_of", lambda _, goal, __: Removal(goal, moves[goal], 1.0)
+    )
     supports = (replace(ON_TABLE, probability=0.7), Support("o1", "o2", probability=probability))
     graph = SupportGraph((TABLE, CUBE, RIDER), supports)
     voxels = half_known(unseen, TABLE, CUBE, RIDER) if unseen else known(TABLE, CUBE, RIDER)
-    assert settled(graph, "o1", 0.95, voxels, SupportConfig()) is expected
-    assert settled(graph, "o2", 0.95, voxels, SupportConfig())
-    assert not settled(graph, "o9", 0.95, voxels, SupportConfig())
-    assert settled(graph, None, 0.7, voxels, SupportConfig()) is (probability >= 0.7)
+
+    def is_settled(goal, until):
+        return settled(graph, goal, until, predict_goal(graph, goal, voxels, SupportConfig()))
+
+    assert is_settled("o1", 0.95) is expected
+    assert is_settled("o2", 0.95)
+    assert not is_settled("o9", 0.95)
+    assert is_settled(None, 0.7) is (probability >= 0.7)
 
 
 class TestHiddenSurface:

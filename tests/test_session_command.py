@@ -81,13 +81,13 @@ def test_warnings_of_a_view_are_shown(folder, files, capsys, views):
     away = transforms.look_at((-1.2, 0.0, 1.2), (-2.0, 0.0, 1.2)).tolist()
     assert run_command("session", "add", folder, *files(0, T_world_camera=away)) == 0
     captured = capsys.readouterr()
-    assert captured.out == "view 1: 0 objects, 0 supports, graph unchanged\n"
+    assert captured.out == "view 1 (number 0): 0 objects, 0 supports, graph unchanged\n"
     assert "no support surface" in captured.err
 
 
 def test_a_robot_gives_the_poses_it_reaches(folder, files, capsys, views):
     assert run_command("session", "add", folder, *files(0)) == 0
-    assert capsys.readouterr().out == "view 1: 2 objects, 2 supports\n"
+    assert capsys.readouterr().out == "view 1 (number 0): 2 objects, 2 supports\n"
     assert run_command("session", "add", folder, *files(1), "--number", 0) == 1
     assert "the next view is 1" in capsys.readouterr().err
 

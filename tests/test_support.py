@@ -22,7 +22,7 @@ from caryatid.graph import SceneObject, Support
 from caryatid.support.contacts import Contact, find_contacts, find_gap
 from caryatid.support.equilibrium import support_forces
 from caryatid.support.plausibility import closing, drawn, reconcile
-from caryatid.support.relations import explain, infer, predict_removal
+from caryatid.support.relations import Effect, Removal, explain, infer, predict_removal, removal_of
 from caryatid.support.stability import contact_patch
 
 CONFIG = SupportConfig()
@@ -500,6 +500,30 @@ class TestRemoval:
         (effect,) = predict_removal(graph, "o2", many)
         assert effect.object_id == "o3"
         assert 0.4 < effect.probability < norm.cdf(0.5)
+
+    def test_that_nothing_else_moves_is_less_likely_than_that_each_stays(self):
+        """Without o2, each of two slabs has its centre 11 mm inside what is left, and unsure by 10 mm."""
+        objects = [SURFACE, thing(2, (0.1, 0, 0.05), None, (0.06, 0.4, 0.1))]
+        for k, y in ((3, -0.15), (5, 0.15)):
+            objects.append(thing(k, (-0.019, y, 0.05), None, (0.06, 0.06, 0.1)))
+            objects.append(thing(k + 1, (0, y, 0.11), unsure(0.0, 0.0, low_x=0.02), (0.3, 0.06, 0.02)))
+        removal = removal_of(infer(objects, CONFIG), "o2", replace(CONFIG, draws=300))
+        assert {e.object_id for e in removal.effects} == {"o4", "o6"}
+        assert removal.moving == ()
+        stay = [1.0 - e.probability for e in removal.effects]
+        assert removal.rest == pytest.approx(np.prod(stay), abs=0.02)
+        assert removal.rest < min(stay) - 0.02
+        few = removal_of(infer(tower(), CONFIG), "o2", CONFIG)
+        assert [e.object_id for e in few.moving] == ["o3"]
+        assert 0.9 < few.rest < 1.0, "a few draws make nothing certain"
+
+    def test_a_removal_is_told_in_a_sentence(self):
+        effects = tuple(Effect(i, "", p) for i, p in (("o2", 1.0), ("o3", 1.0), ("o5", 0.4), ("o6", 0.04)))
+        text = "o2 and o3 move (1.00), o5 moves (0.40), nothing else moves (0.93)"
+        assert str(Removal("o1", effects, 0.93, 0.02)) == text
+        assert str(Removal("o1", effects[3:], 0.93, 0.5)) == (
+            "nothing else moves (0.93), 50% of the space on o1 is unseen"
+        )
 
     def test_what_is_held_down_moves_without_its_weight_and_takes_others_along(self):
         assert self.effects(counterweight(), "o3") == {"o2": True}

@@ -18,7 +18,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import Change, SupportGraph, TakeStep
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, Planner, PlanningState, check_candidates, path_cost
-from caryatid.planning.goals import settled
+from caryatid.planning.goals import predict_goal, settled
 from caryatid.planning.planners import make_planner
 from caryatid.planning.planners.hidden_surface import SupportPlanner
 from caryatid.robots import Posture, Robot, Unreachable, view_sphere_of, way_to
@@ -29,6 +29,7 @@ from caryatid.runtime.parallel import one_blas_thread
 from caryatid.scene import Scene, Stopwatch
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Camera, Cloud, View
+from caryatid.support.relations import Removal
 
 log = logging.getLogger(__name__)
 
@@ -81,6 +82,7 @@ class Step(Pictured):
         robot: Posture of the robot, or None if unknown.
         changes: Changes of objects since the previous view, seen or reported.
         lift: The object removed after this view, or None.
+        removal: With a goal that was found: what moves when it is removed; otherwise None.
     """
 
     index: int
@@ -100,6 +102,7 @@ class Step(Pictured):
     robot: RobotPose | None = None
     changes: tuple[Change, ...] = ()
     lift: TakeStep | None = None
+    removal: Removal | None = None
 
     def __repr__(self) -> str:
         following = f"stop: {self.stop}" if self.decision is None else f"next: {self.decision.why}"
@@ -279,14 +282,30 @@ class Explorer:
         step = self._newest()
         if step.decision is None or step.candidates is None:
             return step.stop
-        state = self._state(step.candidates)
-        goal, until, config = self.goal, self._until, self.scene.config.support
+        state, goal, until = self._state(step.candidates), self.goal, self._until
         # Without a goal, nothing checks whether objects are hidden in the first view.
         asked = until if goal is not None or step.index > 0 else None
-        if asked is not None and settled(state.graph, goal, asked, state.voxels, config):
-            what = "every support" if goal is None else f"what moves without {goal}"
-            return f"{what} is known with probability {asked:g}"
+        if asked is not None and settled(state.graph, goal, asked, self.predict().removal):
+            if goal is None:
+                return f"every support is known with probability {asked:g}"
+            return f"whether each object moves without {goal} is known with probability {asked:g}"
         return reason_to_stop(state, self.scene.changed, self._planner, step.decision)
+
+    def predict(self) -> Step:
+        """Predict what moves when the goal is removed.
+
+        Returns:
+            The newest step, with its `removal`.
+
+        Raises:
+            PlanningError: No view was taken yet.
+        """
+        step, scene = self._newest(), self.scene
+        if step.removal is None or step.removal.object_id != self.goal:
+            assert scene.voxels is not None
+            removal = predict_goal(step.graph, self.goal, scene.voxels, scene.config.support)
+            self.step = replace(step, removal=removal)
+        return self._newest()
 
     def choose(self, chosen: Decision | int) -> Step:
         """Choose another view instead of the planner's.
@@ -428,6 +447,7 @@ def explore(
         if reason is None:
             step = explorer.plan()
             reason = explorer.reason_to_stop() if early_stop and step.stop is None else None
+        step = replace(step, removal=explorer.predict().removal)
         if reason is not None:
             step = replace(step, candidates=None, decision=None, stop=reason)
         if step.decision is not None:

@@ -55,6 +55,11 @@ def is_recording(source: str) -> bool:
     return path.exists() and format_of(path) is not None
 
 
+def is_name(source: str) -> bool:
+    """Whether SOURCE is the name of a built-in scene or a sample; names come before files."""
+    return is_builtin(source) or find_sample(source) != Path(source)
+
+
 def is_cloud(source: str) -> bool:
     """Whether SOURCE is the name of a cloud."""
     return find_sample(source).suffix.lower() in (".pcd", ".ply")
@@ -223,13 +228,17 @@ def extract(
 
 
 def _check_no_run(source: str) -> None:
-    """Reject a run, a session and a graph.json, unless a built-in scene has its name."""
+    """Reject a run, a session and a graph.json; say what is used if a name comes before a file."""
     path = Path(source)
     if path.suffix == ".json" and path.is_file():
         lifts, made = f"`caryatid order {source}`", f"`caryatid export {source} --out scene.xml`"
         remedy = f"plan lifts with {lifts}, or make it a scene with {made}"
         raise InputError(source, "is a graph, not a scene or recording", remedy)
-    if not is_builtin(source) and (is_run(path) or is_session(path)):
+    if is_name(source):
+        if path.exists():
+            hint = "%s: using the one that comes with caryatid; for the file or folder here, write ./%s"
+            log.info(hint, source, source)
+    elif is_run(path) or is_session(path):
         view, score, order = (f"`caryatid {command} {source}`" for command in ("view", "evaluate", "order"))
         remedy = f"view it with {view}, score it with {score}, or plan lifts with {order}"
         raise InputError(

@@ -32,6 +32,7 @@ from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.robots import Posture
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+from caryatid.support.relations import Effect, Removal
 
 FORMAT: Final = "caryatid/run"
 AGAIN: Final = "run caryatid again"
@@ -40,7 +41,7 @@ PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
 """Packages whose versions run.json records."""
 PARTS = (
     View, Cloud, ViewSphere, Candidates, Decision, PointOfInterest, Posture, RobotPose, Change, TakeStep,
-    Grasp,
+    Grasp, Removal, Effect,
 )  # fmt: skip
 """Classes that a step is made of."""
 
@@ -233,6 +234,7 @@ class _RunFile:
     warnings: list[str] = field(default_factory=list)
     versions: dict[str, str] = field(default_factory=dict)
     conditions: str | None = None
+    source_path: str = ""
     date: str = ""
 
 
@@ -346,6 +348,8 @@ def _summary(step: Step) -> dict[str, Any]:
     record["changes"] = [asdict(change) for change in step.changes]
     if step.lift is not None:
         record["lift"] = step.lift.to_json()
+    if step.removal is not None:
+        record["removal"] = step.removal.to_json()
     if step.candidates is not None:
         record["candidates"] = {"reachable": len(step.candidates), "rejected": step.candidates.rejected}
     if step.decision is not None:

@@ -17,7 +17,6 @@ from rich.text import Text
 if TYPE_CHECKING:
     from caryatid.evaluation.scores import Score
     from caryatid.exploration import Step
-    from caryatid.graph import SupportGraph
 
 
 class Output(logging.Handler):
@@ -76,19 +75,24 @@ class Output(logging.Handler):
                 Console(highlight=False).print(item)
         sys.stdout.flush()
 
-    def step(self, step: Step, before: SupportGraph | None, score: Score | None) -> None:
+    def step(self, step: Step, before: Step | None, score: Score | None) -> None:
         """Print what a view changed, its score if the ground truth is known, and the next view."""
-        from caryatid.viz.tables import census, changes
+        from caryatid.viz.tables import census, changes, noticed
 
-        f1 = "" if score is None else f", F1 {score.f1:.3f}"
-        self.say(f"view {step.index + 1}: {census(step.graph)}{f1} ({turn(step.timings):.1f} s)")
-        for change in step.changes:
+        lift, f1 = step.lift, "" if score is None else f", F1 {score.f1:.3f}"
+        # The last graph is that after the lift.
+        lifted = lift is not None and all(o.id != lift.object_id for o in step.graph.objects)
+        when = ", after its lift" if lifted else ""
+        self.say(f"view {step.index + 1}{when}: {census(step.graph)}{f1} ({turn(step.timings):.1f} s)")
+        for change in noticed(before, step):
             self.say(f"  {change}")
-        for line in changes(before, step.graph):
+        for line in changes(before, step):
             kind, _, items = line.partition(": ")
             self.say(f"  {kind}: " + items.replace(", ", "\n" + " " * (len(kind) + 4)))
-        if step.lift is not None:
-            self.say(f"  removed {step.lift.object_id}: {step.lift.why}")
+        if step.removal is not None:
+            self.say(f"  without {step.removal.object_id}: {step.removal}")
+        if lift is not None:
+            self.say(f"  removed {lift.object_id}: {lift.why}")
         if step.decision is not None:
             self.say(f"  next view: {step.decision.why}")
         if step.stop is not None:

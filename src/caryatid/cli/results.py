@@ -100,7 +100,10 @@ class Evaluate(options.Command):
             "edge_recall": "edge\nrecall", "mean_iou": "mean\nIoU", "brier": "Brier\nscore",
             "average_precision": "average\nprecision",
         }  # fmt: skip
-        rows = [[f"{view['view'] + 1}", *(f"{view[name]:.3f}" for name in columns)] for view in views]
+        rows = [
+            [str(number), *("–" if view[name] is None else f"{view[name]:.3f}" for name in columns)]
+            for number, view in enumerate(views, start=1)
+        ]
         truth = self.truth or "the ground truth of its source"
         shown = table(f"{self.run} against {truth}", ["view", *columns.values()], rows, figures=True)
         output.result({"views": views, "warnings": output.warnings}, shown)

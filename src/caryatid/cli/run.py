@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import webbrowser
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -50,7 +51,11 @@ class RunCommand(options.ComputingCommand):
         raise NotImplementedError
 
     def run(self, config: Config, page: PageProcess | None = None) -> None:
-        """Save all steps, write the report and print the result."""
+        """Save all steps, write the report and print the result.
+
+        Raises:
+            GoalError: No view shows the goal; the run folder keeps the views.
+        """
         from caryatid.cli.output import profile
         from caryatid.io.graph_json import graph_to_json
         from caryatid.steps import RunWriter
@@ -60,13 +65,16 @@ class RunCommand(options.ComputingCommand):
         with RunWriter(self.out, config, _about(self)) as writer:
             name, truth, steps = self.open(config)
             writer.more["conditions"] = conditions = _conditions(self)
-            graph = _record(writer, steps, truth, output, f"{name} ({conditions})", page).graph
+            last = _record(writer, steps, truth, output, f"{name} ({conditions})", page)
         if not self.no_report:
             _draw_report(self.out, output)
-        output.say(f"{name}: {census(graph)} after {count_of(len(writer.steps), 'view')}")
+        _check_found(getattr(self, "goal", None), last)
+        output.say(f"{name}: {census(last.graph)} after {count_of(len(writer.steps), 'view')}")
         output.say(f"run: {self.out}" if self.no_report else f"report: {self.out / 'report.html'}")
-        document: dict[str, Any] = {"run": str(self.out), "graph": graph_to_json(graph)}
-        document["warnings"] = output.warnings
+        document: dict[str, Any] = {"run": str(self.out), "stop": last.stop}
+        if last.removal is not None:
+            document["removal"] = last.removal.to_json()
+        document |= {"graph": graph_to_json(last.graph), "warnings": output.warnings}
         if self.profile:
             document["profile"], shown = profile(writer.steps)
             output.result(document, shown)
@@ -110,6 +118,7 @@ class Explore(RunCommand, options.ExploringCommand):
         with self.output.working("opening"):
             masks = self.mask_source(config)
             source = _opening(self, masks)(config)
+        _check_goal(self, source)
         planner, camera = planner_for(self.chosen_planner, source.camera, source.truth, config, **known)
         known |= {"planner": planner, "config": config, "masks": masks}
         known |= {"goal": self.goal, "until": self.until, "early_stop": not self.no_early_stop}
@@ -167,10 +176,11 @@ class View(options.ExploringCommand):
     """Print the address of the page, but do not open a browser."""
 
     def __call__(self) -> None:
+        from caryatid.sources import is_name
         from caryatid.steps import is_run, is_session
 
         config, output, path = self.config(), self.output, Path(self.source)
-        finished = is_run(path) or is_session(path)
+        finished = not is_name(self.source) and (is_run(path) or is_session(path))
         # The page shares the interpreter with the loop: a tenth of Python's interval lets it answer at once.
         sys.setswitchinterval(0.0005)
         with closing(self._open_run(path) if finished else self._open_loop(config)) as page:
@@ -182,12 +192,16 @@ class View(options.ExploringCommand):
             wait_for_interrupt()
 
     def _open_run(self, folder: Path) -> Page:
+        from caryatid.evaluation.truths import evaluate_run
         from caryatid.sessions.reading import open_run
         from caryatid.steps import read_config, read_steps
         from caryatid.viewer.page import Page
 
         with open_run(folder) as run:
             steps, scores = read_steps(run), [score["f1"] for score in run.record.get("scores", ())]
+            if not scores:
+                with suppress(InputError), self.output.working("evaluating"):
+                    scores = [score.f1 for score in evaluate_run(run)]
             title = f"caryatid: {run.folder.name}"
             page = Page(title, read_config(run).support, host=self.host, port=self.port)
             for step in steps:
@@ -274,7 +288,6 @@ class Clear(options.LiftingCommand, options.ExploringCommand):
         from caryatid.cli import NOT_SAFE
         from caryatid.cli.output import table
         from caryatid.exploration import Explorer
-        from caryatid.graph import object_id
         from caryatid.io.json_files import plain
         from caryatid.manipulation.clearing import clear
         from caryatid.manipulation.dismantling import SimulatedHands
@@ -292,11 +305,7 @@ class Clear(options.LiftingCommand, options.ExploringCommand):
         camera = source.camera
         if not isinstance(camera, SimulatedCamera):
             raise InputError(self.source, "cannot be simulated", "give a built-in scene or an MJCF scene")
-        labels = range(1, len(camera.scene.object_bodies) + 1)
-        ids = [object_id(label) for label in labels if self.segmentation != "auto" and masks is None]
-        if ids and self.goal is not None and self.goal not in ids:
-            reason = "is not an object of the scene"
-            raise GoalError(f"--goal {self.goal}", reason, f"known objects: {', '.join(ids)}")
+        _check_goal(self, source)
         known: dict[str, Any] = {"segmentation": self.segmentation, "seed": seed, "masks": masks}
         known |= {"planner": self.chosen_planner, "config": config}
         explorer = Explorer(camera, source.robot, **known)
@@ -330,10 +339,8 @@ class Clear(options.LiftingCommand, options.ExploringCommand):
             last = _record(writer, steps, None, output, f"{source.name} ({conditions})")
         if not self.no_report:
             _draw_report(self.out, output)
-        found = [o.id for o in last.graph.objects if o.role == "object"]
-        if self.goal is not None and self.goal not in found and not lifts:
-            reason = f"was not found in {count_of(last.index + 1, 'view')}"
-            raise GoalError(f"--goal {self.goal}", reason, f"objects found: {', '.join(found) or 'none'}")
+        if not lifts:
+            _check_found(self.goal, last)
         harmed = sorted({body for lift in lifts for body in lift["disturbed"]})
         gone = {lift["object"] for lift in lifts if lift["body"] is not None}
         reached = self.goal in gone if self.goal else not hands.left
@@ -369,6 +376,31 @@ def wait_for_interrupt() -> None:
         return
 
 
+def _check_goal(command: Explore | Clear, source: Source) -> None:
+    """Reject a goal that is not among the simulator's labels."""
+    from caryatid.graph import object_id
+    from caryatid.simulation.camera import SimulatedCamera
+
+    goal, camera = command.goal, source.camera
+    automatic = command.segmentation == "auto" or command.settings.masks_from is not None
+    if goal is None or automatic or not isinstance(camera, SimulatedCamera):
+        return
+    ids = [object_id(label) for label in camera.scene.object_bodies]
+    if goal not in ids:
+        reason = "is not an object of the scene"
+        raise GoalError(f"--goal {goal}", reason, f"known objects: {', '.join(ids)}")
+
+
+def _check_found(goal: str | None, last: Step) -> None:
+    """Reject a goal that the last graph lacks."""
+    from caryatid.viz.tables import count_of
+
+    found = [o.id for o in last.graph.objects if o.role == "object"]
+    if goal is not None and goal not in found:
+        reason = f"was not found in {count_of(last.index + 1, 'view')}"
+        raise GoalError(f"--goal {goal}", reason, f"objects found: {', '.join(found) or 'none'}")
+
+
 @contextmanager
 def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]:
     """Open a page for an exploration; after its end, keep the page open until Ctrl-C."""
@@ -398,6 +430,8 @@ def _conditions(command: RunCommand | Clear) -> str:
 
 def _about(command: RunCommand | Clear) -> dict[str, Any]:
     """Entries of run.json about the command."""
+    from caryatid.sources import is_name
+
     names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands", "reach")
     options = {name: getattr(command, name) for name in names if hasattr(command, name)}
     options |= {"preset": command.settings.preset, "masks": command.settings.masks}
@@ -406,7 +440,11 @@ def _about(command: RunCommand | Clear) -> dict[str, Any]:
     if isinstance(command, Explore):
         options["early_stop"] = not command.no_early_stop
     name, seed = type(command).__name__.lower(), command.settings.seed
-    return {"command": name, "source": command.source, "seed": seed, "options": options}
+    about = {"command": name, "source": command.source, "seed": seed, "options": options}
+    if not is_name(command.source) and Path(command.source).exists():
+        # Run and source may be moved together.
+        about["source_path"] = os.path.relpath(Path(command.source).resolve(), command.out.resolve())
+    return about
 
 
 def _record(
@@ -430,7 +468,7 @@ def _record(
         if last is not None and step.index == last.index:
             output.say(f"  done: {step.stop}")
         else:
-            output.step(step, None if last is None else last.graph, scored)
+            output.step(step, last, scored)
         if page is not None:
             page.add(step, None if scored is None else scored.f1)
         last = step

@@ -111,7 +111,9 @@ class Add(SessionStep):
         for line in (*added.warnings, *map(str, added.changes)):
             self.output.say(line)
         news = "" if added.changed else ", graph unchanged"
-        self.show(added.to_json(), f"view {added.number + 1}: {census(added.graph)}{news}")
+        self.show(
+            added.to_json(), f"view {added.number + 1} (number {added.number}): {census(added.graph)}{news}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

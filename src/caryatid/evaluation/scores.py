@@ -69,9 +69,9 @@ class Score:
         vertex_precision: Vertices alone, the table included [1].
         vertex_recall: Vertices alone [1].
         mean_iou: Mean IoU of the matched objects without the table; 0 if none is matched [1].
-        brier: Brier score of the forecasts: their mean squared error; 0 is perfect [1].
+        brier: Brier score of the forecasts: their mean squared error; 0 is perfect, or without forecasts [1].
         average_precision: Area under precision over recall of the forecasts as the probability threshold
-            falls from 1; 1 is perfect [1].
+            falls from 1; 1 is perfect, or without forecasts [1].
         matches: Extracted vertex → its true vertex.
         ious: IoU of each matched object [1].
         forecasts: One for each support in the graph between matched vertices, and one with probability 0 for
@@ -109,9 +109,11 @@ class Score:
         """F1 of edges alone [1]."""
         return _harmonic_mean(self.edge_precision, self.edge_recall)
 
-    def to_json(self) -> dict[str, float]:
-        """Entry of a view in `caryatid evaluate --json`."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.type == "float"}
+    def to_json(self) -> dict[str, float | None]:
+        """Entry of a view in `caryatid evaluate --json`; what nothing was matched for is None."""
+        based_on = {"mean_iou": self.ious, "brier": self.forecasts, "average_precision": self.forecasts}
+        names = [f.name for f in fields(self) if f.type == "float"]
+        return {name: getattr(self, name) if based_on.get(name, True) else None for name in names}
 
 
 def score(

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from pathlib import Path
+
+import numpy as np
 
 from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.scores import Score, TrueScene, score, score_masks
+from caryatid.geometry.transforms import Array
 from caryatid.io.bop import read_recording
 from caryatid.io.datasets import find_sample
+from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, load_scene
 from caryatid.simulation.truth import GroundTruth, ground_truth, read_truth
-from caryatid.simulation.world import SimulatedScene, table_centre, true_shapes
+from caryatid.simulation.world import SimulatedScene, posed, table_centre, true_shapes
 from caryatid.steps import Run, read_run
 
 log = logging.getLogger(__name__)
@@ -49,7 +54,8 @@ def evaluate_run(
 ) -> tuple[Score, ...]:
     """Score every view of a run, in order, as `caryatid evaluate RUN [GT]` does.
 
-    Warn if no object of the last view matches: the truth is probably of something else.
+    After each lift of a clear run, the truth is what physics says of the objects that are left. Warn if no
+    object of the last view matches: the truth is probably of something else.
 
     Args:
         run_folder: The folder of a run, or the run as read.
@@ -61,11 +67,13 @@ def evaluate_run(
         InputError: The run or the truth is missing or broken, or they do not fit each other.
     """
     run = run_folder if isinstance(run_folder, Run) else read_run(run_folder)
-    source = str(run.record["source"] if truth is None else truth)
+    source = str(_source_of(run) if truth is None else truth)
     folder = find_sample(source)
     if is_builtin(source) or (folder / SCENE_FILE).is_file() or folder.suffix == ".xml":
-        scene = true_scene_from_simulation(load_scene(source))
-        scores = [score(view.graph, scene, config=config) for view in run.views]
+        scores = [
+            score(view.graph, true, config=config)
+            for view, true in zip(run.views, _truths(run, load_scene(source)), strict=True)
+        ]
     elif (folder / "scene_camera.json").is_file():
         known, recording = read_truth(folder / TRUTH_FILE), read_recording(folder)
         # A recording of one frame needs no names.
@@ -87,3 +95,37 @@ def evaluate_run(
             "%s: none of its objects matches one of %s; give the ground truth of this run", run.folder, source
         )
     return tuple(scores)
+
+
+def _source_of(run: Run) -> str | Path:
+    """The run's own source: where it lies from the run folder, or else as typed."""
+    path = run.folder.resolve() / run.record.get("source_path", "")
+    typed: str = run.record["source"]
+    return path.resolve() if "source_path" in run.record and path.exists() else typed
+
+
+def _truths(run: Run, scene: SimulatedScene) -> Iterator[TrueScene]:
+    """The truth at each view; a graph that lacks the object lifted after its view is that after the lift."""
+    lifts = {lift["view"]: lift for lift in run.record.get("lifts", ())}
+    true = true_scene_from_simulation(scene)
+    for number, view in enumerate(run.views):
+        lift, after = lifts.get(number), true
+        if lift is not None:
+            after = _truth_after(scene, np.array(lift["state"]))
+        lacks = lift is not None and all(o.id != lift["object"] for o in view.graph.objects)
+        yield after if lacks else true
+        true = after
+
+
+def _truth_after(scene: SimulatedScene, state: Array) -> TrueScene:
+    """The truth of the objects of a scene that are not put aside, in a state (N, 7)."""
+    names = list(scene.object_bodies.values())
+    if state.shape != (len(names), 7):
+        reason = f"has {len(names)} objects, but the run removed objects from {len(state)}"
+        raise InputError(scene.source, reason, "give the scene of this run")
+    scene = posed(scene, state)
+    gone = {name for name, z in zip(names, state[:, 2], strict=True) if z >= ASIDE / 2.0}
+    known = ground_truth(scene)
+    vertices = tuple(name for name in known.vertices if name not in gone)
+    edges = tuple(edge for edge in known.edges if not {edge.supporter, edge.supported} & gone)
+    return true_scene_from_simulation(scene, GroundTruth(vertices, edges))

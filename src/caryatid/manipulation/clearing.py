@@ -73,7 +73,7 @@ def clear(
             elif missed == MISSES:
                 reason = f"{MISSES} lifts in a row found no object in place"
         assert explorer.step is not None
-        step = replace(explorer.step, lift=lift)
+        step = replace(explorer.step, lift=lift, removal=None)
         if reason is not None:
             # No further view shows what is left.
             step = replace(step, graph=explorer.scene.graph, candidates=None, decision=None, stop=reason)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TypeGuard
 
 import numpy as np
@@ -13,7 +14,7 @@ from caryatid.geometry.polygons import hull
 from caryatid.graph import SupportGraph
 from caryatid.planning.expected_visibility import SPACE, Samples, surface_samples
 from caryatid.sensing.voxel_map import UNKNOWN, VoxelMap
-from caryatid.support.relations import predict_removal
+from caryatid.support.relations import Removal, removal_of
 
 
 def relevant(graph: SupportGraph, goal: str) -> set[str]:
@@ -43,33 +44,46 @@ def matter(samples: Samples, graph: SupportGraph, goal: str | None) -> NDArray[n
     return about | (space & near)
 
 
-def settled(
-    graph: SupportGraph, goal: str | None, until: float, voxels: VoxelMap, config: SupportConfig
-) -> bool:
+def predict_goal(
+    graph: SupportGraph, goal: str | None, voxels: VoxelMap, config: SupportConfig
+) -> Removal | None:
+    """Say what moves when the goal is removed, or return None if no view has shown it.
+
+    Args:
+        graph: The support graph.
+        goal: Id of the object to remove, or None.
+        voxels: The voxel map.
+        config: The numbers the graph was inferred with.
+    """
+    if not _knows(goal, graph):
+        return None
+    samples = surface_samples(graph, voxels.occluders([o.shape for o in graph.objects]))
+    level = samples.normals_world[:, 2] > np.cos(np.radians(config.max_tilt))
+    top = level & (samples.subjects == samples.names.index(goal))
+    above = samples.points_world[top] + 1.5 * voxels.config.size * samples.normals_world[top]
+    unseen = voxels.state_at(above) == UNKNOWN
+    share = float(unseen.mean()) if len(unseen) else 0.0
+    return replace(removal_of(graph, goal, config), unseen=share)
+
+
+def settled(graph: SupportGraph, goal: str | None, until: float, removal: Removal | None) -> bool:
     """Whether everything relevant is known with a probability of at least `until`.
 
     Without a goal, this is the existence of every support. With a goal, it is whether each object moves or
     stays when the goal is removed, and that nothing unseen rests on the goal: at least that share of its
-    free surface up to `config.max_tilt` lies next to seen space.
+    free upper side lies next to seen space.
 
     Args:
         graph: The support graph.
         goal: Id of the object to remove, or None.
         until: The probability [1].
-        voxels: The voxel map.
-        config: The numbers the graph was inferred with.
+        removal: What `predict_goal` says.
     """
     if goal is None:
         return all(s.belief >= until for s in graph.supports)
-    if not _knows(goal, graph) or any(
-        1.0 - until < e.probability < until for e in predict_removal(graph, goal, config)
-    ):
+    if removal is None or any(1.0 - until < e.probability < until for e in removal.effects):
         return False
-    samples = surface_samples(graph, voxels.occluders([o.shape for o in graph.objects]))
-    level = samples.normals_world[:, 2] > np.cos(np.radians(config.max_tilt))
-    top = level & (samples.subjects == samples.names.index(goal))
-    above = samples.points_world[top] + 1.5 * voxels.config.size * samples.normals_world[top]
-    return bool((voxels.state_at(above) == UNKNOWN).sum() <= (1.0 - until) * len(above))
+    return removal.unseen <= 1.0 - until
 
 
 def _knows(goal: str | None, graph: SupportGraph) -> TypeGuard[str]:

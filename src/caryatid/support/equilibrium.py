@@ -103,8 +103,8 @@ def moved_without(
     beliefs: Array,
     config: SupportConfig,
     rng: np.random.Generator,
-) -> Array:
-    """Probability (N,) that each object moves when one is removed [1].
+) -> tuple[Array, Array]:
+    """Probability (D, N) that each object moves when one is removed, in each of D draws [1].
 
     Args:
         objects: The support surface and the objects.
@@ -113,24 +113,25 @@ def moved_without(
             the draws say less, an earlier view said; then the other one moves.
         config: The unknowns, and when an object is at rest.
         rng: Source of the draws.
+
+    Returns:
+        The probabilities, and how much a draw counts for each object (D, N) [1].
     """
-    scene, count = Equilibrium(objects, config), len(objects)
-    moves, held, total = np.zeros(count), np.zeros(count), np.zeros(count)
-    visible = np.where(scene.explained, 1.0, 1.0 - config.unexplained)[index]
+    scene, moves, trusts = Equilibrium(objects, config), [], []
+    held, visible = np.zeros(len(objects)), np.where(scene.explained, 1.0, 1.0 - config.unexplained)[index]
     for draw in scene.draws(rng):
         balance, after = scene.solve(draw), scene.solve(draw, without=[index]).motion
         rests = balance.motion <= config.at_rest
-        trust = np.where(rests, 1.0, config.unexplained)
-        sure = trust * np.where(rests, 1.0, 1.0 - config.unexplained)
+        trust, sure = np.where(rests, 1.0, config.unexplained), np.where(rests, 1.0, 1.0 - config.unexplained)
         fell = after > balance.motion + config.at_rest
-        moves += fell * sure
-        held += ((balance.pushes[index, :, 2] > config.force_share) | fell) * sure
-        total += trust
-    held, moves = held / total * visible, moves / total
-    moves = np.fmax(moves, moves + (1.0 - moves) * (beliefs - held))
-    moves[index] = 0.0
-    probability: Array = moves.clip(0.0, 1.0)
-    return probability
+        held += ((balance.pushes[index, :, 2] > config.force_share) | fell) * sure * trust
+        moves.append(fell * sure)
+        trusts.append(trust)
+    counts = np.array(trusts)
+    unsaid = np.fmax(beliefs - held / counts.sum(axis=0) * visible, 0.0)
+    probability: Array = 1.0 - (1.0 - np.array(moves)) * (1.0 - unsaid)
+    probability[:, index] = 0.0
+    return probability.clip(0.0, 1.0), counts
 
 
 @dataclass(frozen=True, eq=False, slots=True)

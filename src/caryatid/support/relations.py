@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import groupby, permutations
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.geometry import polygons
 from caryatid.geometry.transforms import Array
-from caryatid.graph import LIKELY, Kind, SceneObject, Stability, Support, SupportGraph
+from caryatid.graph import DOUBTFUL, LIKELY, Kind, SceneObject, Stability, Support, SupportGraph
 from caryatid.support.contacts import Contact, find_gap
 from caryatid.support.equilibrium import moved_without, support_forces, touching
 from caryatid.support.stability import assess
@@ -31,6 +32,45 @@ class Effect:
     object_id: str
     why: str
     probability: float
+
+
+@dataclass(frozen=True, slots=True)
+class Removal:
+    """What happens to the other objects when one is removed.
+
+    Attributes:
+        object_id: Id of the removed object.
+        effects: The objects that move with a probability above 0, the most likely first.
+        rest: Probability that no object moves but those in `moving` [1].
+        unseen: Share of its free upper side next to unseen space, where something may rest on it [1]; 0
+            without a voxel map.
+    """
+
+    object_id: str
+    effects: tuple[Effect, ...]
+    rest: float
+    unseen: float = 0.0
+
+    @property
+    def moving(self) -> tuple[Effect, ...]:
+        """The effects that are not as good as excluded."""
+        return tuple(e for e in self.effects if e.probability > 1.0 - DOUBTFUL)
+
+    def to_json(self) -> dict[str, Any]:
+        """Entry `removal` in the output of `--json`."""
+        moving = [{"object": e.object_id, "probability": e.probability, "why": e.why} for e in self.moving]
+        return {"object": self.object_id, "moving": moving, "rest": self.rest, "unseen": self.unseen}
+
+    def __str__(self) -> str:
+        clauses = []
+        for likely, alike in groupby(self.moving, lambda e: f"{e.probability:.2f}"):
+            *others, last = (e.object_id for e in alike)
+            verb = "move" if others else "moves"
+            clauses.append(f"{', '.join(others)}{' and ' * bool(others)}{last} {verb} ({likely})")
+        clauses.append(f"nothing else moves ({self.rest:.2f})")
+        if self.unseen > 1.0 - DOUBTFUL:
+            clauses.append(f"{100.0 * self.unseen:.0f}% of the space on {self.object_id} is unseen")
+        return ", ".join(clauses)
 
 
 def infer(
@@ -110,7 +150,12 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
 
 
 def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) -> tuple[Effect, ...]:
-    """Say which objects move when one is removed, and how likely.
+    """Say which objects move when one is removed, and how likely: the effects of `removal_of`."""
+    return removal_of(graph, object_id, config).effects
+
+
+def removal_of(graph: SupportGraph, object_id: str, config: SupportConfig) -> Removal:
+    """Say what moves, and whether nothing else does, when an object is removed.
 
     In a sampled scene, an object moves if it is at rest with all objects, but not without the removed one;
     what rests on it moves with it.
@@ -121,7 +166,7 @@ def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) 
         config: The numbers the graph was inferred with.
 
     Returns:
-        The effects, the most likely first.
+        The removal.
 
     Raises:
         InputError: There is no such object, or it is the support surface.
@@ -133,10 +178,17 @@ def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) 
     for s in graph.supports:
         if s.supporter == object_id:
             beliefs[_index(graph, s.supported)] = s.belief
-    moves = moved_without(graph.objects, index, beliefs, config, np.random.default_rng(0))
-    moving = {o.id: float(p) for o, p in zip(graph.objects, moves, strict=True) if p > 0.0}
+    moves, trust = moved_without(graph.objects, index, beliefs, config, np.random.default_rng(0))
+    shares = ((moves * trust).sum(axis=0) / trust.sum(axis=0)).clip(0.0, 1.0)
+    moving = {o.id: float(p) for o, p in zip(graph.objects, shares, strict=True) if p > 0.0}
     effects = [Effect(i, _loss(graph, i, {object_id, *moving}), p) for i, p in moving.items()]
-    return tuple(sorted(effects, key=lambda e: -e.probability))
+    removal = Removal(object_id, tuple(sorted(effects, key=lambda e: -e.probability)), 1.0)
+    listed = {e.object_id for e in removal.moving}
+    rest = [k for k, o in enumerate(graph.objects) if o.id in moving.keys() - listed]
+    weights = trust[:, rest].min(axis=1, initial=1.0)
+    disturbed = float(weights @ (1.0 - np.prod(1.0 - moves[:, rest], axis=1)))
+    # As for rehearsals: that a few draws move nothing does not make it certain.
+    return replace(removal, rest=1.0 - (disturbed + 0.5) / (float(weights.sum()) + 1.0))
 
 
 def _index(graph: SupportGraph, object_id: str) -> int:

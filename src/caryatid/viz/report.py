@@ -30,6 +30,7 @@ from caryatid.viz.tables import (
     changes,
     count_of,
     doubts,
+    noticed,
     object_table,
     point_table,
     sentence,
@@ -148,12 +149,14 @@ def make_report(
     width = (config or ReportConfig()).image_width
     seen: list[Step] = []
     views: list[Section] = []
-    contacts, shown, last, most = [], None, None, 0
+    contacts, happened, shown, last, most = [], list[tuple[str, str]](), None, None, 0
     for number, step in enumerate(steps):
         f1 = f"F1 {scores[number]['f1']:.3f}" if number < len(scores) else ""
         before = seen[-1] if seen else None
-        news = "" if before is None else "; ".join(changes(before.graph, step.graph)) or "no change"
-        views.append(_view(step, news, f1, width))
+        news = "" if before is None else "; ".join(changes(before, step)) or "no change"
+        told = [(f"Before view {step.index + 1}", str(change)) for change in noticed(before, step)]
+        happened += told
+        views.append(_view(step, news, f1, width, told))
         if step.view is not None:
             picture = draw_image(step.view, step.labels, step.graph, width // 2, shapes=False)
             why = "the first view" if before is None else ""
@@ -175,7 +178,7 @@ def make_report(
     removed = f"{count_of(len(strip), 'object')} removed. " if strip else ""
     sections = [*_answer(last, shown, len(seen), scores[-1] if scores else None, width, removed)]
     facts = [("Warning", sentence(warning)) for warning in warnings]
-    facts += [(f"Before view {step.index + 1}", str(change)) for step in seen for change in step.changes]
+    facts += happened
     facts += [("Finished", sentence(last.stop))] if last.stop else []
     pictures = [*contacts * (len(contacts) > 1), *_charts(seen, scores)]
     if pictures or facts:
@@ -210,6 +213,8 @@ def _answer(
         }
         listed = "; ".join(f"{name}: {', '.join(names)}" for name, names in errors.items() if names)
         facts.append(("Compared with the ground truth", sentence(listed or "nothing is wrong or missing")))
+    if step.removal is not None:
+        facts.insert(0, (f"Without {step.removal.object_id}", sentence(str(step.removal))))
     picture, caption = draw_graph(graph, truth.get("wrong", ()), truth.get("missing", ())), SUPPORTS
     if truth.get("wrong") or truth.get("missing"):
         caption += " Red: wrong or missing, compared with the ground truth."
@@ -260,10 +265,11 @@ def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> lis
     return figures
 
 
-def _view(step: Step, news: str, f1: str, width: int) -> Section:
+def _view(step: Step, news: str, f1: str, width: int, happened: Sequence[tuple[str, str]]) -> Section:
     """A view: its counts, its score and what it changed, pictures, what comes next, tables."""
-    decision = step.decision
-    facts, tables = [("Before this view", str(change)) for change in step.changes], []
+    decision, facts, tables = step.decision, [*happened], []
+    if step.lift is not None:
+        facts.append((f"Removed {step.lift.object_id}", sentence(step.lift.why)))
     if decision is not None:
         scores = (
             f"saliency {decision.saliency:.2f}, path cost {decision.cost:.2f}, score {decision.score:.2f}"

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from caryatid.geometry.shapes import Cylinder, Shape, Sphere
-from caryatid.graph import SceneObject, SupportGraph
+from caryatid.graph import Change, SceneObject, SupportGraph
 from caryatid.viz.colours import object_colour, saliency_colour
 
 if TYPE_CHECKING:
+    from caryatid.exploration import Step
     from caryatid.manipulation.order import Order
     from caryatid.planning.decision import Decision
 
@@ -185,13 +186,24 @@ def sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}." if text else ""
 
 
-def changes(before: SupportGraph | None, after: SupportGraph) -> list[str]:
-    """List the changes of a view: one line each for objects found, changed, and gone."""
-    known, now = {} if before is None else _supported(before), _supported(after)
+def noticed(before: Step | None, step: Step) -> list[Change]:
+    """List what happened to objects before a view, without the lift after the view before."""
+    lifted = None if before is None or before.lift is None else before.lift.object_id
+    return [c for c in step.changes if (c.kind, c.object_id) != ("removed", lifted)]
+
+
+def changes(before: Step | None, step: Step) -> list[str]:
+    """List the changes of a view: one line each for objects found, changed, and gone.
+
+    Those that were lifted, or `noticed` as removed, are not listed as gone.
+    """
+    known, now = {} if before is None else _supported(before.graph), _supported(step.graph)
+    lifts = [each.lift for each in (before, step) if each is not None and each.lift is not None]
+    told = {lift.object_id for lift in lifts} | {c.object_id for c in step.changes if c.kind == "removed"}
     lines = {
         "found": [f"{name} {text}" for name, text in now.items() if name not in known],
         "now": [f"{name} {text}" for name, text in now.items() if known.get(name, text) != text],
-        "gone": [name for name in known if name not in now],
+        "gone": [name for name in known if name not in now and name not in told],
     }
     return [f"{kind}: {', '.join(items)}" for kind, items in lines.items() if items]
 
