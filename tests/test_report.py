@@ -263,6 +263,31 @@ def test_charts_need_several_views_or_scores_and_changes_are_listed(make_step):
         charts(steps, scores[:1])
 
 
+def test_all_that_is_doubtful_is_listed_with_its_reason(make_step):
+    box = make_graph().objects[1]
+    many = tuple(replace(box, id=f"o{k}", label=k, probability=1.0, poor_fit=False) for k in range(1, 10))
+
+    def listed(objects, probability):
+        supports = [Support("o0", o.id, probability=probability, why=f"why {o.id}") for o in objects]
+        graph = SupportGraph((make_graph().objects[0], *objects), tuple(supports))
+        sections = make_report("t", [replace(make_step(0), graph=graph)], config=SMALL).sections
+        (section,) = (s for s in sections if s.title == "What is doubtful")
+        return section.text, section.facts
+
+    text, facts = listed(many, 0.89)
+    assert text == ""
+    assert [(name.split(",")[0], why.split(".")[0]) for name, why in facts] == [
+        (f"o0 → {o.id}", f"why {o.id}") for o in many
+    ]
+    text, facts = listed(many, 0.91)
+    assert text.startswith("Nothing: ")
+    assert facts == []
+    text, facts = listed((replace(many[0], probability=0.6), *many[1:]), 0.91)
+    assert (text, [name for name, _ in facts]) == ("", ["o1"])
+    assert "0.60" in facts[0][1]
+    assert listed(many, None)[0].startswith("The probability of supports is unknown")
+
+
 def test_a_chart_has_the_packages_own_style():
     chart = draw_chart("t", "number", {"found": [9.0, np.nan, 11.0], "gone": [2.0, 3.0, 4.0]})
     with mpl.rc_context({"font.size": 30.0, "axes.facecolor": "red", "svg.fonttype": "path"}):

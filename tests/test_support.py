@@ -502,12 +502,13 @@ class TestRemoval:
         assert 0.4 < effect.probability < norm.cdf(0.5)
 
     def test_that_nothing_else_moves_is_less_likely_than_that_each_stays(self):
-        """Without o2, each of two slabs has its centre 11 mm inside what is left, and unsure by 10 mm."""
+        """Without o2, each of two slabs has its centre 12 mm inside what is left, and unsure by 10 mm."""
         objects = [SURFACE, thing(2, (0.1, 0, 0.05), None, (0.06, 0.4, 0.1))]
         for k, y in ((3, -0.15), (5, 0.15)):
-            objects.append(thing(k, (-0.019, y, 0.05), None, (0.06, 0.06, 0.1)))
+            objects.append(thing(k, (-0.018, y, 0.05), None, (0.06, 0.06, 0.1)))
             objects.append(thing(k + 1, (0, y, 0.11), unsure(0.0, 0.0, low_x=0.02), (0.3, 0.06, 0.02)))
-        removal = removal_of(infer(objects, CONFIG), "o2", replace(CONFIG, draws=300))
+        many = replace(CONFIG, draws=300)
+        removal = removal_of(infer(objects, many), "o2", many)
         assert {e.object_id for e in removal.effects} == {"o4", "o6"}
         assert removal.moving == ()
         stay = [1.0 - e.probability for e in removal.effects]

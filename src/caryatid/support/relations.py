@@ -54,7 +54,7 @@ class Removal:
     @property
     def moving(self) -> tuple[Effect, ...]:
         """The effects that are not as good as excluded."""
-        return tuple(e for e in self.effects if e.probability > 1.0 - DOUBTFUL)
+        return tuple(e for e in self.effects if e.probability >= 1.0 - DOUBTFUL)
 
     def to_json(self) -> dict[str, Any]:
         """Entry `removal` in the output of `--json`."""

@@ -50,8 +50,6 @@ SUPPORTS = (
 """Caption of a support graph."""
 WIDE = 680.0
 """Width from which a graph cannot be read in half the page [px]: more than eight vertices side by side."""
-MOST = 6
-"""Maximum number of listed doubts [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -214,7 +212,7 @@ def _answer(
         listed = "; ".join(f"{name}: {', '.join(names)}" for name, names in errors.items() if names)
         facts.append(("Compared with the ground truth", sentence(listed or "nothing is wrong or missing")))
     if step.removal is not None:
-        facts.insert(0, (f"Without {step.removal.object_id}", sentence(str(step.removal))))
+        facts.insert(0, (f"Without {step.removal.object_id}", f"{step.removal}."))
     picture, caption = draw_graph(graph, truth.get("wrong", ()), truth.get("missing", ())), SUPPORTS
     if truth.get("wrong") or truth.get("missing"):
         caption += " Red: wrong or missing, compared with the ground truth."
@@ -234,9 +232,12 @@ def _answer(
         figures.append(Figure(heading, solid, still, share, page=page, page_caption=caption))
     yield Section("Answer", text, figures if wide else figures[:2], facts)
     doubtful = doubts(graph)
-    nothing = f"Nothing: all supports have a probability above {DOUBTFUL}, and all shapes fit."
-    more = [("More", f"{len(doubtful) - MOST} others; see the tables.")] if len(doubtful) > MOST else []
-    yield Section("What is doubtful", "" if doubtful else nothing, facts=doubtful[:MOST] + more)
+    text = f"Nothing: all supports and objects have a probability above {DOUBTFUL}, and all shapes fit."
+    if any(s.probability is None for s in graph.supports):
+        text = "The probability of supports is unknown: it is not part of the rules of the paper."
+    elif doubtful:
+        text = ""
+    yield Section("What is doubtful", text, facts=doubtful)
     if figures[2:] and not wide:
         yield Section("In 3D", figures=figures[2:])
 

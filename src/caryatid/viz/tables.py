@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from caryatid.geometry.shapes import Cylinder, Shape, Sphere
-from caryatid.graph import Change, SceneObject, SupportGraph
+from caryatid.graph import DOUBTFUL, Change, SceneObject, SupportGraph
 from caryatid.viz.colours import object_colour, saliency_colour
 
 if TYPE_CHECKING:
@@ -144,7 +144,8 @@ def census(graph: SupportGraph) -> str:
 def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
     """List doubtful supports and objects with the reason and a view that would help, most doubtful first.
 
-    An object is doubtful if it has no known supporter, or its shape fits poorly or is implausible.
+    An object is doubtful if it has no known supporter, its shape fits poorly or is implausible, or the
+    probability that its pose and size are about right is low.
     """
     found = []
     for s in sorted(graph.supports, key=lambda s: abs(s.belief - 0.5)):
@@ -156,6 +157,8 @@ def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
         known = item.role == "support_surface" or graph.supporters(item.id)
         reasons = [poor] * item.poor_fit + [item.doubt] * bool(item.doubt)
         reasons += ["its supporter is unknown"] * (not known)
+        if item.probability is not None and item.probability <= DOUBTFUL:
+            reasons.append(f"its pose and size are about right with probability {item.probability:.2f} only")
         if reasons:
             found.append((item.id, f"{'; '.join(reasons)}. {_settled_by(graph, item.id)}"))
     return found
