@@ -298,6 +298,15 @@ def test_a_chart_has_the_packages_own_style():
 
 
 @pytest.mark.slow
+def test_the_axis_of_a_share_ends_at_one():
+    ends = [
+        re.findall(r">([\d.]+)<", picture_svg(draw_chart("t", "F1", {"F1": [0.6, 0.7]}, top=top)))
+        for top in (None, 1.0)
+    ]
+    assert "1.0" not in ends[0]
+    assert "1.0" in ends[1]
+
+
 def test_any_step_is_drawn(make_step):
     """Without colour, decision, pose, view, objects or points."""
     dark = make_step(decide=False)

@@ -109,6 +109,23 @@ def test_only_layers_that_changed_are_sent_again(step, drawn):
     assert [name for name in first if first[name] is not again[name]] == ["/cloud/points"]
 
 
+def test_a_shape_moves_as_a_whole_and_is_not_replaced(step, drawn):
+    graph, before = step.graph, drawn(step)
+    T = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, 0.3)), (0.1, 0.0, 0.2))
+    objects = [replace(o, shape=o.shape.moved(T)) if o.id == "o1" else o for o in graph.objects]
+    after = drawn(replace(step, graph=replace(graph, objects=tuple(objects))))
+    for name in ("/shapes/o1", "/shapes/o1/edges", "/shapes/o2", "/names/o1"):
+        assert after[name] is before[name]
+    body, edges, shape = after["/shapes/o1"], after["/shapes/o1/edges"], objects[1].shape
+    np.testing.assert_allclose(body.position, shape.T_world_object[:3, 3])
+    np.testing.assert_allclose(edges.position, 0.0)
+    ends_world = transforms.transform(shape.T_world_object, edges.points.astype(float))
+    np.testing.assert_allclose(ends_world, shape.creases(), atol=1e-3)
+    gone = drawn(replace(step, graph=replace(graph, objects=graph.objects[:2], supports=())))
+    assert "/shapes/o1" in gone
+    assert not [name for name in gone if "o2" in name]
+
+
 def test_what_is_hidden_is_not_sent_until_it_is_asked_for(opening, settings):
     page = LoopPage(opening, settings, segmentation="labels")
     page.turn()
@@ -204,9 +221,11 @@ def test_what_is_kept_of_a_step_is_small(step):
 def test_the_panel_describes_an_object(step, settings):
     graph, config = step.graph, settings.support
     text = describe_object(graph, "o1", config)
-    for part in ("box", "o0 → o1", "o1 → o2", "Without o1", "o2 falls with probability 1.00:"):
+    for part in ("box", "o0 → o1", "o1 → o2", "Without o1", "o2 moves with probability 1.00:"):
         assert part in text
-    assert "no object falls" in describe_object(graph, "o2", config)
+    assert re.search(
+        r"<dd>nothing else moves with probability 0\.9\d</dd>", describe_object(graph, "o2", config)
+    )
     assert "Without" not in describe_object(graph, "o0", config)
     doubtful = with_supports(step, Support("o1", "o2", certain=False)).graph
     said = "o1 → o2</dt><dd>bottom-up, probability 0.50, doubtful, 1 of 1 views"
@@ -214,7 +233,10 @@ def test_the_panel_describes_an_object(step, settings):
     assert "not found" in describe_object(graph, "o9", config)
     assert "was removed" in describe_object(graph, "o9", config, taken=True)
     assert "View 1 of 3" in describe_view(step, None, 3)
-    assert "finished</dt><dd>enough" in describe_view(replace(step, stop="enough"), None, 1)
+    assert "next</dt>" in describe_view(step, None, 1)
+    ended = describe_view(replace(step, stop="enough"), None, 1)
+    assert "finished</dt><dd>enough" in ended
+    assert "next</dt>" not in ended
     named = replace(step, name="<img src=x onerror=alert(1)>")
     assert "<img" not in describe_view(named, None, 1)
 
@@ -224,6 +246,10 @@ def test_the_loop_gives_the_views_that_explore_gives_and_says_when_it_would_stop
     page, source = LoopPage(opening, limited, segmentation="labels"), opening(limited)
     steps = explore(source.camera, source.robot, config=limited, segmentation="labels")
     assert [page.turn() for _ in range(3)][:2] == [None, "maximum of 2 views reached"]
+    page.wait()
+    assert "cameras/next" not in page.drawing.nodes
+    page._show_state("", busy=False)
+    assert (page._go.disabled, page._next.disabled) == (True, False)
     page.close()
     assert len(page.steps) == len(page.scores) == 3
     for step, shown, f1 in zip(steps, page.steps, page.scores, strict=False):
@@ -314,20 +340,32 @@ def test_a_ray_points_at_the_view_it_first_meets(step):
 @pytest.mark.parametrize("simulated", [True, False])
 def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(loop, monkeypatch, simulated):
     loop.turn()
-    (step,), shown = loop.steps, []
-    monkeypatch.setattr(loop, "stage", shown.append)
+    (step,), shown, numbers = loop.steps, [], []
+
+    def stage(shown_step):
+        shown.append(shown_step)
+        if shown_step is not None:
+            numbers.append((shown_step.index, len(loop.steps) - 1))
+
+    monkeypatch.setattr(loop, "stage", stage)
     if not simulated:
         loop.source = replace(loop.source, camera=None)
     loop._running.set()
     said = loop.clear()
-    assert said == "finished: " + ("no objects are left; nothing disturbed" if simulated else "a safe order")
+    if simulated:
+        assert said == "Finished: no objects are left; no other object moved."
+    else:
+        assert said == "Finished: all objects can be removed safely in the order listed below."
+        assert loop._order.visible
+        assert loop._order.content.index("o2") < loop._order.content.index("o1")
     rising = next(
         s for s in shown if s and s.graph["o2"].centre_world[2] > step.graph["o2"].centre_world[2] + 0.01
     )
     assert step.graph["o2"].label not in rising.cloud.labels
     assert step.graph["o1"].label in rising.cloud.labels
     assert {s.pair for s in rising.graph.supports} == {("o0", "o1")}
-    last = loop.steps[-1] if simulated else shown[-1]
+    assert all(index == newest for index, newest in numbers), "a lift belongs to the newest view"
+    last = loop.steps[-1] if simulated else shown[-2]
     assert [o.id for o in last.graph.objects] == ["o0"]
     assert [s.lift.object_id for s in loop.steps if s.lift] == (["o2", "o1"] if simulated else [])
 
@@ -512,11 +550,11 @@ def test_the_first_sight_is_the_objects_with_their_names_on_them(page, tab):
 
 
 @pytest.mark.slow
-def test_a_click_on_an_object_says_what_falls_without_it(page, tab):
+def test_a_click_on_an_object_says_what_moves_without_it(page, tab):
     crate = page.steps[-1].graph["o1"]
     tab.click(page, crate.centre_world - (0.0, 0.0, crate.shape.extents[2] / 4.0))
     tab.wait_for_text("Without o1")
-    tab.wait_for_text("falls with probability")
+    tab.wait_for_text("moves with probability")
     assert "o2" in tab.page.locator(".caryatid-cell").last.inner_text()
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     found = axe.run(tab.page, context={"include": [[".caryatid-cell"]]}).response["violations"]
@@ -571,7 +609,7 @@ def test_a_view_is_chosen_by_hand(page, tab):
 def test_everything_is_removed(page, tab):
     page.describe("o2")
     tab.press("clear")
-    tab.wait_for_text("finished: no objects are left; nothing disturbed")
+    tab.wait_for_text("Finished: no objects are left; no other object moved.")
     tab.wait_for_node("/shapes/o1", there=False)
     tab.wait_for_node("/shapes/o2", there=False)
     tab.wait_for_text("was removed")

@@ -138,7 +138,7 @@ class SceneDrawing:
         layers: dict[str, tuple[object, ...]] = {
             "cloud": (step.cloud, point_size, true_colours),
             "shapes": (step.graph, chosen if any(o.id == chosen for o in step.graph.objects) else ""),
-            "names": (step.graph,),
+            "names": tuple((o.id, o.label) for o in step.graph.objects if o.role == "object"),
             "sphere": (step.sphere, step.candidates, decision),
             "interest": (step.sphere, decision),
             "robot": (step.robot, steps[-2] if len(steps) > 1 else None),
@@ -146,19 +146,19 @@ class SceneDrawing:
         for each in steps:
             colour = SURE if each is steps[-1] else EARLIER
             layers[f"cameras/{each.index + 1}"] = f"{each.index + 1}", each.view, None, colour
-        if decision is not None:
+        if decision is not None and step.stop is None:
             colour = BY_HAND if decision.why == "chosen by hand" else NEXT
             layers["cameras/next"] = "next", steps[-1].view, decision, colour
         with self._server.atomic():
             for name in self._shown.keys() - layers.keys() - {"supports"}:
                 del self._shown[name]
-                for node in self.nodes.pop(name):
-                    node.remove()
+                self._remove(name)
+                del self.nodes[name]
             for name, shown in layers.items():
                 layer = name.partition("/")[0]
                 if self._frames[layer].visible and self._shown.get(name) != shown:
-                    for node in self.nodes.get(name, ()):
-                        node.remove()
+                    if layer != "shapes":
+                        self._remove(name)
                     self.nodes[name], self._shown[name] = getattr(self, f"_{layer}")(*shown), shown
             self._graph = step.graph
             self.face(T_world_eye)
@@ -183,10 +183,16 @@ class SceneDrawing:
                 if at is not None:
                     node.wxyz, node.position = facing, _nearer(eye_world, at)
                     node.scale = LETTER * ON_TOP * float(np.linalg.norm(at - eye_world))
-            for node in self.nodes["supports"]:
-                node.remove()
+            self._remove("supports")
             self.nodes["supports"] = self._supports(graph, eye_world)
         self._shown["supports"] = drawn
+
+    def _remove(self, name: str, kept: Sequence[Any] = ()) -> None:
+        """Remove a layer's nodes from the scene, but those kept."""
+        names = {node.name for node in kept}
+        for node in reversed(self.nodes.get(name, [])):  # Edges before their shape.
+            if node.name not in names:
+                node.remove()
 
     def _points(self, name: str, points: Array, colours: NDArray[np.uint8], size: float) -> Any:
         """Points (N, 3); they are sent as half floats, and so counted from their middle."""
@@ -204,36 +210,43 @@ class SceneDrawing:
         return [self._points("/cloud/points", cloud.points_world, colours, size)]
 
     def _shapes(self, graph: SupportGraph, chosen: str) -> list[Any]:
-        """Shapes and their edges; where one is chosen, the others are faint."""
-        nodes, outlines, colours = [], [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3), dtype=np.uint8)]
+        """Shapes and their edges; where one is chosen, the others are faint.
+
+        Known shapes are changed in place, and edges are part of them: a slow browser replaces shapes one by
+        one, and meanwhile shows some where they are and others where they were.
+        """
+        known, nodes = {node.name: node for node in self.nodes["shapes"]}, []
         for item in graph.objects:
             mesh, T_world_object = item.shape.mesh(), item.shape.T_world_object
-            colour = rgb(object_colour(item.label))
-            opacity = 1.0 if chosen in (item.id, "") else 0.3
-            body = self._scene.add_mesh_simple(
-                f"/shapes/{item.id}", mesh.vertices, mesh.faces, color=colour, opacity=opacity, side="double",
-                flat_shading=item.shape.kind == "box", cast_shadow=False, receive_shadow=False,
-                **_pose(T_world_object),
-            )  # fmt: skip
-            body.on_click(lambda _, name=item.id: self._clicked(name))
-            nodes.append(body)
-            outlines.append(item.shape.creases())
+            name, colour = f"/shapes/{item.id}", rgb(object_colour(item.label))
+            look = {"vertices": mesh.vertices, "faces": mesh.faces, "color": colour}
+            look |= {"opacity": 1.0 if chosen in (item.id, "") else 0.3} | _pose(T_world_object)
+            look["flat_shading"] = item.shape.kind == "box"
+            ends = transforms.transform(transforms.invert(T_world_object), item.shape.creases())
             dark = (0.55 * np.array(colour)).astype(np.uint8)
-            colours.append(np.tile(dark, (len(outlines[-1]), 2, 1)))
-        edges, paint = np.concatenate(outlines), np.concatenate(colours)
-        return [*nodes, *self._lines("/shapes/outlines", edges, paint, **SCREEN)]
+            if name in known:
+                nodes.append(_changed(known[name], look))
+            else:
+                still = {"side": "double", "cast_shadow": False, "receive_shadow": False}
+                nodes.append(self._scene.add_mesh_simple(name, **look, **still))
+                nodes[-1].on_click(lambda _, name=item.id: self._clicked(name))
+            edges = f"{name}/edges"
+            if edges in known and len(ends):
+                nodes.append(_changed(known[edges], {"points": ends, "colors": dark}))
+            else:
+                nodes += self._lines(edges, ends, dark, **SCREEN)
+        self._remove("shapes", nodes)
+        return nodes
 
-    def _names(self, graph: SupportGraph) -> list[Any]:
+    def _names(self, *named: tuple[str, int]) -> list[Any]:
         nodes = []
-        for item in graph.objects:
-            if item.role == "support_surface":
-                continue
-            plate = np.asarray(name_plate(item))
+        for object_id, label in named:
+            plate = np.asarray(name_plate(object_id, label))
             width = plate.shape[1] / plate.shape[0]
             node = self._scene.add_image(
-                f"/names/{item.id}", plate, width, 1.0, cast_shadow=False, format="png"
+                f"/names/{object_id}", plate, width, 1.0, cast_shadow=False, format="png"
             )
-            node.on_click(lambda _, name=item.id: self._clicked(name))
+            node.on_click(lambda _, name=object_id: self._clicked(name))
             nodes.append(node)
         return nodes
 
@@ -379,6 +392,13 @@ def _nearer(eye_world: Array, point_world: Array) -> Array:
     """A point on the way from the eye, near what it hides."""
     nearer: Array = eye_world + ON_TOP * (point_world - eye_world)
     return nearer
+
+
+def _changed(node: Any, look: dict[str, Any]) -> Any:
+    """A node with these properties; viser sends those that differ."""
+    for name, value in look.items():
+        setattr(node, name, value)
+    return node
 
 
 def _pose(T_world: Array) -> dict[str, Any]:

@@ -30,6 +30,8 @@ from caryatid.runtime.parallel import cores
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.lifting import ASIDE
 from caryatid.viewer.page import Page
+from caryatid.viz.notebook import cell_html
+from caryatid.viz.report import Section
 
 if TYPE_CHECKING:
     from caryatid.io.mask_sources import MaskSource
@@ -105,6 +107,7 @@ class LoopPage(Page):
         if self.ended is not None:
             return self.ended
         self.stage(None)
+        self._order.visible = False
         explorer, truth, f1 = self._explorer, self.source.truth, None
         with self.working:
             if explorer.step is not None and (step := explorer.go()).stop is not None:
@@ -115,9 +118,10 @@ class LoopPage(Page):
             step = explorer.plan()
             if truth is not None:
                 f1 = score(step.graph, truth, np.random.default_rng(0)).f1
+            reason = used_up(step.index + 1, self._config.active) or explorer.reason_to_stop()
         self._planned, self.ended = step.decision, step.stop
-        self.add(step, f1)
-        return used_up(len(self.steps), self._config.active) or explorer.reason_to_stop()
+        self.add(replace(step, stop=reason), f1)
+        return reason
 
     def use_planner(self, name: str) -> str:
         """Replace the planner, starting with the next view; return a message.
@@ -180,10 +184,17 @@ class LoopPage(Page):
             nonlocal said
             step, before = explorer.step, hands.state
             assert step is not None
+            self.stage(None)
+            self.add(step)
             taken = hands.take(lift, hands.bodies(step.graph))
             film.extend(_without(step, (), lift.object_id, T) for T in _moves(taken, hands.names, before))
             camera.scene = hands.scene
-            said = f"{lift.object_id} removed; {', '.join(taken.disturbed) or 'nothing'} disturbed"
+            done = (
+                f"Removed {lift.object_id}"
+                if taken.body is not None
+                else f"Found nothing at {lift.object_id}"
+            )
+            said = f"{done}; {_moved(taken.disturbed)}."
             harmed.update(taken.disturbed)
             return taken.body is not None
 
@@ -192,10 +203,12 @@ class LoopPage(Page):
             with self.working:
                 step = next(steps, None)
             if step is None:
-                return f"finished: {self.ended}; {', '.join(sorted(harmed)) or 'nothing'} disturbed"
+                return f"Finished: {self.ended}; {_moved(sorted(harmed))}."
             self._show(film)
             film.clear()
-            self.stage(None)
+            # A lifted object stays away, though the graph holds it until the next view.
+            gone = None if step.lift is None or step.stop is not None else step.lift.object_id
+            self.stage(None if gone is None else _without(step, {gone}, gone, {}))
             self.add(step)
             self.say(said)
             self.ended = step.stop
@@ -204,6 +217,14 @@ class LoopPage(Page):
     def _show_order(self, step: Step, config: Config) -> str:
         with self.working:
             order = plan_order(step.graph, config, seed=self._options["seed"], threads=cores())
+        facts = [
+            (
+                f"{number}. {lift.object_id}",
+                f"hold {', '.join(lift.hold)}; {lift.why}" if lift.hold else lift.why,
+            )
+            for number, lift in enumerate(order.steps, 1)
+        ]
+        self._order.content, self._order.visible = cell_html(Section("Order", facts=facts)), True
         rising = [transforms.rigid(np.eye(3), (0.0, 0.0, height)) for height in np.linspace(0.0, 0.5, 8)[1:]]
         gone: set[str] = set()
         for lift in order.steps:
@@ -212,7 +233,8 @@ class LoopPage(Page):
             self._show(_without(step, gone, lift.object_id, {lift.object_id: T}) for T in rising)
             gone.add(lift.object_id)
             self.stage(_without(step, gone, lift.object_id, {}))
-        return f"finished: {order.refusal or 'a safe order'}"
+        self.stage(None)
+        return f"Finished: {order.refusal or 'all objects can be removed safely in the order listed below'}."
 
     def _show(self, film: Iterable[Step]) -> None:
         for picture in film:
@@ -251,6 +273,7 @@ class LoopPage(Page):
             by_hand = gui.add_checkbox("choose by hand", False, hint=hint)
             hint = "Remove all objects: look until a lift is safe, remove the object, look again"
             self._clear = gui.add_button("clear", hint=hint)
+            self._order = gui.add_html("", visible=False)
         self._choices = planner, fusion
         self._next.on_click(lambda _: self.start())
         self._go.on_click(lambda _: self._keep_doing("running", self._run))
@@ -287,7 +310,8 @@ class LoopPage(Page):
 
     def _show_state(self, text: str, *, busy: bool) -> None:
         self.say(text)
-        self._next.disabled = self._go.disabled = busy or self.ended is not None
+        self._next.disabled = busy or self.ended is not None
+        self._go.disabled = busy or (bool(self.steps) and self.steps[-1].stop is not None)
         self._pause.disabled = not busy
         simulated = isinstance(self.source.camera, SimulatedCamera)
         self._clear.disabled = busy or not self.steps or (simulated and self.ended is not None)
@@ -326,7 +350,11 @@ class LoopPage(Page):
 
 
 def _finished(reason: str | None) -> str | None:
-    return reason and f"finished: {reason}"
+    return reason and f"Finished: {reason}."
+
+
+def _moved(names: Sequence[str]) -> str:
+    return f"{', '.join(names)} moved" if names else "no other object moved"
 
 
 def candidate_under(

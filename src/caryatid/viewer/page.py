@@ -29,14 +29,14 @@ from caryatid.geometry import transforms
 from caryatid.graph import SupportGraph
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import direction
-from caryatid.support.relations import predict_removal
+from caryatid.support.relations import removal_of
 from caryatid.viewer.drawing import LAYERS, NEXT, SceneDrawing, reduced, step_of_scene, thinned
 from caryatid.viz.colours import SALIENCY_STOPS, object_colour, scale
 from caryatid.viz.drawings import draw_chart, draw_layers
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.notebook import cell_html
 from caryatid.viz.report import Figure, Section
-from caryatid.viz.tables import census, object_table, support_table
+from caryatid.viz.tables import census, noticed, object_table, support_table
 
 
 class Page:
@@ -47,7 +47,7 @@ class Page:
 
     Args:
         title: Title of the page.
-        support: Settings with which the graphs were inferred, to predict which objects fall.
+        support: Settings with which the graphs were inferred, to predict which objects move.
         host: Address to listen on; on 127.0.0.1, only programs on this machine can connect.
         port: Port to listen on; if taken, the next free one; 0 = any free port.
         small: Fold the panels at first, for a small page such as in a notebook.
@@ -83,7 +83,7 @@ class Page:
         self._support, self._small = support or SupportConfig(), small
         self._shown, self._chosen = -1, ""
         self._staged: Step | None = None
-        self._graph_drawn: SupportGraph | None = None
+        self._graph_drawn: SupportGraph | tuple[str, ...] | None = None
         self._charted: list[float | None] = []
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
@@ -176,7 +176,8 @@ class Page:
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=NEXT)
         self.server.scene.set_up_direction("+z")
         self._notice = gui.add_html("", order=-20, visible=False)
-        self._slider = gui.add_slider("view", 1, 2, 1, 1, disabled=True, hint="Go back to an earlier view")
+        hint = "Go back to an earlier view"
+        self._slider = gui.add_slider("view", 1, 2, 1, 1, visible=False, hint=hint)
         self._slider.on_update(lambda _: self.go_to(int(self._slider.value) - 1))
         self._summary = gui.add_html("")
         self._boxes: dict[str, Any] = {}
@@ -243,30 +244,35 @@ class Page:
         step, f1 = steps[-1], scores[self._shown]
         if self._staged is not None:
             step, f1 = self._staged, None
-        look = {"point_size": self._size.value / 1000.0, "true_colours": self._true_colours.value}
-        self.drawing.show(step, steps, T_world_eye=self._T_world_eye, chosen=chosen, **look)
-        last = len(self.steps) - 1
-        self._slider.max = max(last + 1, 2)
-        self._slider.disabled = last == 0
-        self._slider.value = self._shown + 1
-        self._summary.content = describe_view(step, f1, last + 1)
-        self._driving = self._soon(self._driving, self._drive)
-        graph = step.graph
-        if graph is not self._graph_drawn:
-            self._graph_drawn = graph
+        count, graph = len(self.steps), step.graph
+        before = steps[-2] if len(steps) > 1 else None
+        texts = [(self._summary, describe_view(step, f1, count, before))]
+        # While an object is lifted, only the places of the vertices change.
+        drawn = graph if self._staged is None else tuple(o.id for o in graph.objects)
+        if drawn != self._graph_drawn:
+            self._graph_drawn = drawn
             picture = draw_graph(graph, compact=True)
-            self._graph.content = cell_html(Section("", figures=[Figure("", picture)]))
+            texts.append((self._graph, cell_html(Section("", figures=[Figure("", picture)]))))
         if scores != self._charted and any(f1 is not None for f1 in scores):
             self._charted = scores
-            chart = draw_chart(
-                "F1 after each view", "F1", {"F1": [np.nan if f1 is None else f1 for f1 in scores]}
-            )
-            self._chart.content = cell_html(Section("", figures=[Figure("", chart)]))
+            known = [np.nan if f1 is None else f1 for f1 in scores]
+            chart = draw_chart("F1 after each view", "F1", {"F1": known}, top=1.0)
+            texts.append((self._chart, cell_html(Section("", figures=[Figure("", chart)]))))
         if chosen:
             with self.working:
                 gone = {each.lift.object_id for each in steps if each.lift is not None}
                 taken = chosen in gone | {o.id for o in steps[-1].graph.objects}
-                self._about.content = describe_object(graph, chosen, self._support, taken=taken)
+                texts.append((self._about, describe_object(graph, chosen, self._support, taken=taken)))
+        look = {"point_size": self._size.value / 1000.0, "true_colours": self._true_colours.value}
+        # Scene and texts change together.
+        with self.server.atomic():
+            self.drawing.show(step, steps, T_world_eye=self._T_world_eye, chosen=chosen, **look)
+            self._slider.visible = count > 1
+            self._slider.max = max(count, 2)
+            self._slider.value = self._shown + 1
+            for panel, text in texts:
+                panel.content = text
+        self._driving = self._soon(self._driving, self._drive)
 
 
 def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
@@ -291,14 +297,18 @@ def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
 # Texts beside the scene
 
 
-def describe_view(step: Step, f1: float | None, count: int) -> str:
-    """Describe the scene after a view, and the next view."""
+def describe_view(step: Step, f1: float | None, count: int, before: Step | None = None) -> str:
+    """Describe the scene after a view, what happened since the step before, and what comes next."""
     facts = [] if f1 is None else [("F1", f"{f1:.3f}")]
-    if step.decision is not None:
-        facts.append(("next", step.decision.why))
+    facts += [(change.kind, f"{change.object_id}: {change.why}") for change in noticed(before, step)]
+    if step.removal is not None:
+        facts.append((f"without {step.removal.object_id}", str(step.removal)))
+    if step.lift is not None:
+        facts.append(("removed", f"{step.lift.object_id}: {step.lift.why}"))
     if step.stop is not None:
         facts.append(("finished", step.stop))
-    facts += [(change.kind, f"{change.object_id}: {change.why}") for change in step.changes]
+    elif step.decision is not None:
+        facts.append(("next", step.decision.why))
     return cell_html(Section(f"View {step.index + 1} of {count}", census(step.graph), facts=facts))
 
 
@@ -322,7 +332,7 @@ def _describe_signs() -> str:
 def describe_object(
     graph: SupportGraph, object_id: str, config: SupportConfig, *, taken: bool = False
 ) -> str:
-    """Describe an object: its edges, what falls without it, size and fit; or that it was removed."""
+    """Describe an object: its edges, what moves without it, size and fit; or that it was removed."""
     item = next((o for o in graph.objects if o.id == object_id), None)
     if item is None:
         return cell_html(Section(object_id, "was removed" if taken else "not found up to this view"))
@@ -332,9 +342,10 @@ def describe_object(
             evidence = f"{kind.text}, probability {likely.text}, {found.text} views; {why.text}"
             facts.append((f"{supporter.text} → {supported.text}", evidence))
     if item.role == "object":
-        effects = predict_removal(graph, object_id, config)
-        falls = [f"{e.object_id} falls with probability {e.probability:.2f}: {e.why}" for e in effects]
-        facts += [(f"Without {object_id}", text) for text in falls or ["no object falls"]]
+        removal = removal_of(graph, object_id, config)
+        moves = [f"{e.object_id} moves with probability {e.probability:.2f}: {e.why}" for e in removal.moving]
+        moves.append(f"nothing else moves with probability {removal.rest:.2f}")
+        facts += [(f"Without {object_id}", text) for text in moves]
     table = object_table(graph)
     (row,) = (row for row in table.rows if row[0].text == object_id)
     facts += [(name, e.text) for name, e in zip(table.columns, row, strict=True) if e.text][2:]

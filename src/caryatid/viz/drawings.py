@@ -417,13 +417,16 @@ def _painted(step: Step) -> tuple[NDArray[np.uint8], Array]:
     return pixels, dots
 
 
-def draw_chart(title: str, y_name: str, lines: Mapping[str, Sequence[float]]) -> Picture:
+def draw_chart(
+    title: str, y_name: str, lines: Mapping[str, Sequence[float]], top: float | None = None
+) -> Picture:
     """Draw lines over the numbers of views, the first on top and the others' marks larger.
 
     Args:
         title: What the chart shows.
         y_name: Name of the y axis.
         lines: Value after each view, 0 or more, by the name of each line.
+        top: Upper end of the y axis; None = as high as the values.
     """
 
     def draw(axes: Axes) -> None:
@@ -447,7 +450,7 @@ def draw_chart(title: str, y_name: str, lines: Mapping[str, Sequence[float]]) ->
                 **look,
             )
         chart.set_xlim(1.0, max(len(values), 2))
-        chart.set_ylim(bottom=0.0)
+        chart.set_ylim(0.0, top)
         chart.set_xlabel("view", fontsize=11.0)
         chart.set_ylabel(y_name, fontsize=11.0)
         chart.set_title(title, fontsize=12.0, fontweight="bold", loc="left", x=-0.12)

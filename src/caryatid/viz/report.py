@@ -247,7 +247,7 @@ def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> lis
     charts = []
     if scores:
         lines = {name: [s[name.lower()] for s in scores] for name in ("F1", "precision", "recall")}
-        charts.append(draw_chart("F1 over views", "share", lines))
+        charts.append(draw_chart("F1 over views", "share", lines, top=1.0))
     if len(steps) > 1:
         graphs = [step.graph for step in steps]
         found = {

@@ -114,12 +114,12 @@ def _arrow(start: Array, end: Array, radius: float) -> Any:
     return trimesh.creation.cylinder(radius, segment=[start, neck], sections=12) + tip
 
 
-def name_plate(item: SceneObject) -> Image.Image:
-    """Draw the name of an object on a plate of its colour."""
-    colour = object_colour(item.label)
-    image = Image.new("RGB", (24 + 32 * len(item.id), 72), colour)
+def name_plate(name: str, label: int) -> Image.Image:
+    """Draw the name of an object on a plate of the colour of its label."""
+    colour = object_colour(label)
+    image = Image.new("RGB", (24 + 32 * len(name), 72), colour)
     font, middle = ImageFont.load_default(52), (image.width / 2.0, 36.0)
-    ImageDraw.Draw(image).text(middle, item.id, ink_on(colour), font, anchor="mm")
+    ImageDraw.Draw(image).text(middle, name, ink_on(colour), font, anchor="mm")
     ImageDraw.Draw(image).rectangle((0, 0, image.width - 1, 71), outline="white", width=4)
     return image
 
@@ -130,7 +130,7 @@ def _plate(item: SceneObject, azimuth: float) -> tuple[Any, Any, Array]:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    image = name_plate(item)
+    image = name_plate(item.id, item.label)
     image = image.point(lambda value: 255.0 * (value / 255.0) ** 0.45)  # The page shows textures linearly.
     uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     corners = np.column_stack([(uv - 0.5) * LETTER * (image.width / 72.0, 1.0), np.zeros(4)])
