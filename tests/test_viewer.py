@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import shutil
 import sys
 import urllib.error
 import urllib.request
@@ -398,6 +399,20 @@ def test_view_serves_a_run_to_this_machine_until_it_is_stopped(scene_file, tmp_p
     assert all(len(step.cloud) and f1 is not None for step, f1 in shown)
     with pytest.raises(OSError, match="refused"):
         urllib.request.urlopen(address)
+
+
+def test_a_built_in_scene_comes_before_a_run_of_its_name(kept_run, tmp_path, monkeypatch, capsys):
+    shutil.copytree(kept_run, tmp_path / "tower")
+    monkeypatch.chdir(tmp_path)
+    shown = []
+    _waiting(monkeypatch, lambda: None)
+    add = Page.add
+    monkeypatch.setattr(Page, "add", lambda page, *step: (shown.append(step), add(page, *step)))
+    for source, views in (("tower", 1), ("./tower", 2)):
+        shown.clear()
+        assert run_command("view", source, "--no-browser", "--port", 0, *SMALL) == 0
+        assert len(shown) == views
+        assert ("write ./tower" in capsys.readouterr().err) == (source == "tower")
 
 
 def test_only_the_viewers_own_page_with_its_token_comes_in(page):

@@ -118,7 +118,7 @@ class Explore(RunCommand, options.ExploringCommand):
         with self.output.working("opening"):
             masks = self.mask_source(config)
             source = _opening(self, masks)(config)
-        _check_goal(self, source)
+        _check_goal(self, source, config)
         planner, camera = planner_for(self.chosen_planner, source.camera, source.truth, config, **known)
         known |= {"planner": planner, "config": config, "masks": masks}
         known |= {"goal": self.goal, "until": self.until, "early_stop": not self.no_early_stop}
@@ -305,7 +305,7 @@ class Clear(options.LiftingCommand, options.ExploringCommand):
         camera = source.camera
         if not isinstance(camera, SimulatedCamera):
             raise InputError(self.source, "cannot be simulated", "give a built-in scene or an MJCF scene")
-        _check_goal(self, source)
+        _check_goal(self, source, config)
         known: dict[str, Any] = {"segmentation": self.segmentation, "seed": seed, "masks": masks}
         known |= {"planner": self.chosen_planner, "config": config}
         explorer = Explorer(camera, source.robot, **known)
@@ -376,14 +376,14 @@ def wait_for_interrupt() -> None:
         return
 
 
-def _check_goal(command: Explore | Clear, source: Source) -> None:
-    """Reject a goal that is not among the simulator's labels."""
+def _check_goal(command: Explore | Clear, source: Source, config: Config) -> None:
+    """Reject a goal that is not among the simulator's labels, if objects are named by them."""
     from caryatid.graph import object_id
     from caryatid.simulation.camera import SimulatedCamera
 
     goal, camera = command.goal, source.camera
-    automatic = command.segmentation == "auto" or command.settings.masks_from is not None
-    if goal is None or automatic or not isinstance(camera, SimulatedCamera):
+    others = command.segmentation == "auto" or command.settings.masks_from is not None
+    if goal is None or others or config.fusion.masks != "scene" or not isinstance(camera, SimulatedCamera):
         return
     ids = [object_id(label) for label in camera.scene.object_bodies]
     if goal not in ids:

@@ -99,9 +99,9 @@ def evaluate_run(
 
 def _source_of(run: Run) -> str | Path:
     """The run's own source: where it lies from the run folder, or else as typed."""
-    path = run.folder.resolve() / run.record.get("source_path", "")
-    typed: str = run.record["source"]
-    return path.resolve() if "source_path" in run.record and path.exists() else typed
+    typed, path = run.record["source"], run.record.get("source_path")
+    place = (run.folder.resolve() / path).resolve() if path else None
+    return place if place is not None and place.exists() else str(typed)
 
 
 def _truths(run: Run, scene: SimulatedScene) -> Iterator[TrueScene]:
