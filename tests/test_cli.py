@@ -256,7 +256,8 @@ def test_with_a_goal_it_says_what_moves_without_it(tmp_path, scene_file, capsys)
     document = json.loads(capsys.readouterr().out)
     assert document["stop"] == "whether each object moves without o1 is known with probability 0.95"
     (effect,) = document["removal"]["moving"]
-    assert (effect["object"], effect["probability"]) == ("o2", 1.0)
+    assert effect["object"] == "o2"
+    assert effect["probability"] > 0.99
     assert 0.9 < document["removal"]["rest"] < 1.0
 
 
