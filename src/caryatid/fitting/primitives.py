@@ -14,6 +14,7 @@ from caryatid.fitting.least_squares import CONVERGED, levenberg_marquardt
 from caryatid.fitting.search import TRIM, search
 from caryatid.geometry import BOX, CYLINDER, SPHERE, transforms
 from caryatid.geometry.points import quantile
+from caryatid.geometry.polygons import area, hull
 from caryatid.geometry.shapes import KINDS, Shape, Uncertainty
 from caryatid.geometry.signed_distance import copy, gradient, in_frame, sample_surface
 from caryatid.geometry.transforms import Array
@@ -22,7 +23,7 @@ from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 FREE_WEIGHT = 0.01
 """Cost of a shape whose whole inside was seen free [m]; in proportion for a share of it."""
-BARE_SPACING = 0.0065
+BARE_SPACING = 0.008
 """Spacing of the samples on a side that count points near it [m]; a point within twice that is near one."""
 
 
@@ -179,8 +180,19 @@ def _finite(points: Array, normals: Array) -> tuple[Array, Array]:
 
 
 def _with_bare(f: Fit, points: Array) -> Fit:
-    """A fit that has paid for the share of the sides seen that is bare of points (N, 3): 3 mm if all are."""
-    bare = _bare_share(*f.shape.row, np.array(f.seen), points)
+    """A fit that has paid for the share of the sides seen that is bare of points (N, 3): 3 mm if all are.
+
+    The convex hull of its points covers a single flat side exactly, however small it is.
+    """
+    kind, axes, centre, half = f.shape.row
+    sides = np.flatnonzero(f.seen) // 2
+    if len(sides) == 1 and (kind == BOX or (kind == CYLINDER and sides[0] == 2)):
+        across = np.delete(np.arange(3), sides[0])
+        places = np.ascontiguousarray(((points - centre) @ axes)[:, across])
+        whole = (4.0 if kind == BOX else np.pi) * float(half[across].prod())
+        bare = max(1.0 - area(hull(places)) / whole, 0.0)
+    else:
+        bare = _bare_share(kind, axes, centre, half, np.array(f.seen), points)
     return replace(f, cost=f.cost + 0.003 * bare)
 
 
