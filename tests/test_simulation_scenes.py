@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from caryatid.config import PhysicsConfig
+from caryatid.config import LiftConfig, PhysicsConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Shape
@@ -27,8 +27,9 @@ from caryatid.simulation import (
     true_shapes,
     write_truth,
 )
+from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.scenes import DESIGNED, is_builtin
-from caryatid.simulation.world import bounds, scene_from_spec, state_of
+from caryatid.simulation.world import bounds, poses_of, scene_from_spec, state_of
 
 SHARED = Path(__file__).parents[2] / "shared" / "scenes"
 NEEDS_SHARED = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared is absent")
@@ -243,6 +244,15 @@ def test_blocks_are_equal_boxes_close_to_one_another(seed: int):
     shapes = list(true_shapes(scene).values())
     assert all(isinstance(s, Box) and (s.extents == shapes[0].extents).all() for s in shapes)
     assert_close(shapes, 0.016)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_boards_over_an_edge_stand_only_with_their_weight(seed: int):
+    scene = generate("overhang", 4, seed)
+    assert_settled(scene)
+    board = int(np.argmax([shape.extents.max() for shape in true_shapes(scene).values()]))
+    lifting = Lifting(scene.spec, list(scene.object_bodies.values()))
+    assert lifting.lift(poses_of(scene), board + 1, LiftConfig()).disturbed[board]
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Random scenes: piles, heaps between screens, packed objects, household objects, blocks and boards."""
+"""Random scenes: piles, heaps, packed and household objects, blocks, boards and overhanging boards."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from caryatid.simulation.world import (
     true_shapes,
 )
 
-GeneratedKind = Literal["pile", "dense", "packed", "house", "blocks", "boards"]
+GeneratedKind = Literal["pile", "dense", "packed", "house", "blocks", "boards", "overhang"]
 SIZES: dict[GeneratedKind, tuple[int, int]] = {
     "pile": (1, 25),
     "dense": (10, 25),
@@ -40,6 +40,7 @@ SIZES: dict[GeneratedKind, tuple[int, int]] = {
     "house": (1, 14),
     "blocks": (2, 10),
     "boards": (4, 12),
+    "overhang": (4, 12),
 }
 """Kind of a scene → minimum and maximum number of objects, including the screens of a dense one."""
 GAP = 0.002
@@ -55,7 +56,8 @@ _Drop = tuple[Body, bool]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Plan:
-    """Setup of a scene: function that draws each object, screens, size of the table [m], and walls."""
+    """Setup of a scene: function that draws each object, what stands from the start (screens), size of the
+    table [m], and walls."""
 
     draw: Callable[[SimulatedScene | None], _Drop]
     screens: tuple[Body, ...] = ()
@@ -72,7 +74,8 @@ def generate(
     block part of the robot's way around. `packed` pushes them together until they touch. All these use
     primitives. `house` has trays, bowls, mugs, plates, books and the like on and in each other. `blocks` are
     equal boxes in a row, a wall or a pyramid, with gaps of 0 to 15 mm. `boards` has a board, plank or tray on
-    two pillars, with loads on it and lower objects under it.
+    two pillars, with loads on it and lower objects under it. `overhang` has boards over the edge of the table
+    or of a block, each held down by a weight, and other objects around them.
 
     Args:
         kind: Kind of scene.
@@ -97,6 +100,7 @@ def generate(
         "house": partial(_stacked, make=thing, margin=0.12),
         "blocks": _blocks,
         "boards": _boards,
+        "overhang": _overhang,
     }
     return _set_down(name, size, plans[kind](rng, size), physics or PhysicsConfig())
 
@@ -201,6 +205,46 @@ def _pillar(rng: np.random.Generator, height: float) -> Shape:
     return Box(np.eye(4), np.array([*rng.uniform(0.045, 0.08, size=2), height]))
 
 
+def _overhang(rng: np.random.Generator, size: int) -> _Plan:
+    """Boards with the middle 3 to 6 cm over an edge, of the table or of a block; from seven objects on, both.
+
+    The weight on a board's other end has 1.3 to 4 times the moment that holds it.
+    """
+    bodies: list[Body] = []
+    azimuth = rng.integers(4) * np.pi / 2.0
+    for on_block in rng.permutation([False, True])[: 1 + (size >= 7)]:
+        length, width, thick = rng.uniform((0.3, 0.06, 0.015), (0.42, 0.1, 0.025))
+        out, depth, *extents = rng.uniform((0.03, 0.09, 0.05, 0.05, 0.05), (0.06, 0.13, 0.07, 0.07, 0.09))
+        behind = (length / 2.0 - out - extents[0] / 2.0) * rng.uniform(0.7, 1.0)
+        behind = min(behind, 0.6 * depth) if on_block else behind
+        # The edge is the y axis of a frame whose x points outwards.
+        turn = azimuth + np.pi + rng.uniform(-1.0, 1.0) if on_block else azimuth
+        side, along = np.array(TABLE_SIZE if azimuth % np.pi == 0.0 else TABLE_SIZE[::-1]) / 2.0
+        height = rng.uniform(0.08, 0.13) if on_block else 0.0
+        edge = (-0.1, 0.0) if on_block else (side, rng.uniform(-0.5, 0.5) * along)
+        R = transforms.rotation_from_vector((0.0, 0.0, azimuth))
+        at = R @ (*edge, TABLE_HEIGHT + height + CLOSE)
+        T = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, turn)), at)
+
+        def put(x: float, z: float, shape: Sequence[float], density: float, T: Array = T) -> None:
+            T_edge_box = transforms.rigid(np.eye(3), (x, 0.0, z + shape[2] / 2.0))
+            bodies.append(Body(Box(T @ T_edge_box, np.array(shape)), density))
+
+        if on_block:
+            put(-depth / 2.0, -height, (depth, depth, height - CLOSE), 800.0)
+        put(out, 0.0, (length, width, thick), 600.0)
+        holds = 600.0 * length * width * thick * out / (behind * float(np.prod(extents)))
+        put(-behind, thick + CLOSE, extents, max(300.0, holds * rng.uniform(1.3, 4.0)))
+
+    def draw(scene: SimulatedScene | None) -> _Drop:
+        assert scene is not None
+        if rng.random() < 0.3:
+            return _on_another(rng, _upright(rng), scene), True
+        return _let_go(_upright(rng), rng.uniform(-0.5, 0.5, size=2) * TABLE_SIZE * 0.8, scene), False
+
+    return _Plan(draw, tuple(bodies))
+
+
 def _stacked(
     rng: np.random.Generator, size: int, make: Callable[[np.random.Generator], Shape], margin: float
 ) -> _Plan:
@@ -254,8 +298,8 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
 def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: PhysicsConfig) -> bool:
     """Whether all objects rest on the table or each other, with the firm ones, the first, about in place.
 
-    An object whose middle is within a centimetre of the table's edge counts as fallen; none may reach higher
-    than 36 cm above the table. Setting down another one may shift the firm ones by up to 4 cm.
+    An object whose middle is within a centimetre of the table's edge counts as fallen, unless it stood there
+    from the start; none may reach higher than 36 cm above the table. Setting down another one may shift the firm ones by up to 4 cm.
     """
     shapes = true_shapes(scene)
     half = np.array(plan.table) / 2.0 - 0.01
@@ -263,7 +307,7 @@ def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: P
         low, high = bounds(scene, label)
         if low[2] < TABLE_HEIGHT - GAP or high[2] > TABLE_HEIGHT + 0.36:
             return False
-        if (np.abs(shape.T_world_object[:2, 3]) > half).any():
+        if label > len(plan.screens) and (np.abs(shape.T_world_object[:2, 3]) > half).any():
             return False
     for label, solid in enumerate(firm, start=1):
         shift = shapes[label].T_world_object[:3, 3] - solid.shape.T_world_object[:3, 3]

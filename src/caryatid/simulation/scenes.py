@@ -104,6 +104,7 @@ DESCRIPTIONS: Final[Mapping[str, str]] = {
     "house": "household objects on and in each other: trays, bowls, mugs, plates, books, bottles",
     "blocks": "equal boxes in a row, a wall or a pyramid",
     "boards": "a board, plank or tray on two pillars, over other objects",
+    "overhang": "boards over the edge of the table or of a block, held down by weights, and other objects",
 }
 """Descriptions of the designed scenes and of the generated kinds."""
 
