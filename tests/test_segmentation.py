@@ -244,6 +244,13 @@ def test_equal_boxes_are_two_where_a_dark_line_runs_from_edge_to_edge(gap, numbe
     assert sum(o.role == "object" for o in scene.graph.objects) == number
 
 
+def test_a_board_keeps_its_length_beyond_the_edge_of_the_table():
+    board = (np.array([-0.1, 0.5, TABLE + 0.03]), np.array([0.1, 0.4, 0.06]))
+    view = table_scene(from_the_side(elevation=60.0, distance=1.4), [board, STACK[0]], sigma=0.001)
+    for k in (1, 2):
+        assert (parts(view)[view.labels == k] > 0).mean() > 0.95
+
+
 def test_a_seam_is_dark_straight_and_as_long_as_its_border_and_divides_one_face():
     v, u = np.mgrid[:80, :120]
     step = np.where(u < 60, 90, 160)

@@ -76,10 +76,10 @@ def segment(
     part = convex_parts(points, normals, edges, config, steps, borders)
     wide = wide_parts(samples.image(part))
     # Something beside the surface or in the room behind is not an object on it; nor is a wall at its edge,
-    # which begins where the readings of the surface end.
+    # which begins where the readings of the surface end. Of a board that a weight holds, most may be outside.
     over = surface.pixels_over(view, 0.0, np.inf, -config.clearance)[samples.grid][samples.places]
     proper = wide[part]
-    part = _with_share(np.where(proper, part, 0), over, 0.5)
+    part = _with_share(np.where(proper, part, 0), over, 0.2)
     uncut, width = samples.image(part), GAP // config.stride
     if view.rgb is not None and samples.rgb is not None:
         least, seam = config.min_area / samples.spacing**2, find_seams(view.rgb, samples.grid)
@@ -107,6 +107,10 @@ def segment(
     bottom = _enlarged(np.append(part, np.int32(0))[inside], config.stride, waiting.shape)
     bottom[~low[around] | (labels[around] > 0)] = 0
     labels[around] += bottom
+    # What the margin cuts off goes on: a board may hang over the edge by more.
+    beyond = surface.pixels_over(view, config.clearance, config.max_height) & ~foreground
+    beyond &= (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
+    _spread_labels(labels, np.flatnonzero(beyond), view.depth, jump, max(labels.shape))
     return labels, apart
 
 
@@ -148,12 +152,16 @@ def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationCon
 def _spread_labels(labels, waiting, depth, jump, rounds):  # type: ignore[no-untyped-def]
     """Spread labels (H, W) to waiting pixels (N,), ascending, without a depth step from a labelled neighbour.
 
-    In each round a pixel takes the label to its right, then others to their left, below and above. There is a
-    step where depth differs by more than a jump at 1 m, times z² [m].
+    In each round a pixel takes the label to its right, then others to their left, below and above, until none
+    is left that can. There is a step where depth differs by more than a jump at 1 m, times z² [m].
     """
     height, width = labels.shape
-    left = len(waiting)
+    left = before = len(waiting)
     for turn in range(4 * rounds):
+        if turn % 4 == 0:
+            if turn > 0 and left == before:
+                break
+            before = left
         down, right = ((0, 1), (0, -1), (1, 0), (-1, 0))[turn % 4]
         for step in range(left):
             # Against the direction that labels come from, so that none spreads twice in one turn.
