@@ -10,6 +10,11 @@ scene, among the objects that are in the way, finds the fewest lifts.
 
     python benchmarks/clear.py --set gripper.kind=parallel
 
+    python benchmarks/clear.py overhang-6-0 overhang-8-1 --order 5 --hands 2
+
+With `--order`, an order is planned after some views and carried out without looking again, as far as it is
+safe.
+
 With a gripper, a simulated one first performs each lift: a free-flying hand moves along the approach among
 the true objects, closes its fingers with 30 N, and lifts the object by friction. A grasp is clear if it
 touches only its object; it holds if the object rises with it.
@@ -20,6 +25,7 @@ from __future__ import annotations
 import sys
 from collections import deque
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Annotated, Any, Literal
 
 import mujoco
@@ -39,6 +45,7 @@ from caryatid.graph import Grasp, TakeStep
 from caryatid.manipulation.clearing import clear
 from caryatid.manipulation.dismantling import SimulatedHands, Taken
 from caryatid.manipulation.grasps import gripper_boxes
+from caryatid.manipulation.order import plan_order
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.world import SimulatedScene, poses_of, quaternion
@@ -54,6 +61,8 @@ class Args(OnScenes):
     """Number of hands."""
     goals: int = 0
     """Number of objects to reach in each scene, one by one; 0 clears the whole scene."""
+    order: int = 0
+    """Number of views after which a whole order is planned and carried out; 0 looks again after each lift."""
     segmentation: SegmentationMethod = "labels"
     """Where segments come from."""
 
@@ -86,7 +95,16 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
         return done[-1].body is not None
 
     wanted = None if goal is None else f"o{goal}"
-    steps = list(clear(explorer, take, goal=wanted, hands=args.hands))
+    if args.order:
+        steps = [explorer.look()]
+        while len(steps) < args.order and explorer.plan().decision is not None:
+            explorer.go()
+            steps.append(explorer.look())
+        order = plan_order(explorer.scene.graph, config, goal=wanted, hands=args.hands, seed=args.seed)
+        for step in takewhile(lambda step: step.safe, order.steps):
+            take(step)
+    else:
+        steps = list(clear(explorer, take, goal=wanted, hands=args.hands))
     lifted = [t for t in done if t.body is not None]
     harm = [f"{t.step.object_id}: {', '.join(t.disturbed)}" for t in lifted if not t.ok]
     row = {"scene": name, "objects": len(scene.object_bodies), "lifts": len(lifted), "views": len(steps)}

@@ -515,7 +515,7 @@ def _many_objects(segmentation: SegmentationMethod, count: int) -> tuple[list[fl
         turns.append(time.perf_counter() - started)
     peak, started = _peak(Path("/proc/self/status").read_text("ascii")), time.perf_counter()
     if segmentation == "labels":
-        plan_order(scene.graph, config, threads=numba.get_num_threads())
+        plan_order(scene.graph, config, hands=2, threads=numba.get_num_threads())
     ordering = time.perf_counter() - started if segmentation == "labels" else 0.0
     return turns, peak, ordering, len(scene.graph.objects) - 1
 

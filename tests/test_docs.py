@@ -21,6 +21,7 @@ from conftest import SMALL, pcd_text, run_command, without_labels
 from PIL import Image
 
 import caryatid as ct
+from caryatid.cli import NOT_SAFE
 from caryatid.config.settings import write_settings
 from caryatid.io.images import png
 from caryatid.robots.reachability import sample_reachability, write_reachability
@@ -157,7 +158,8 @@ def run_line(words: list[str], capsys) -> None:
             if "sensor.width" in " ".join(arguments):
                 changes = changes[len(SMALL) :]
             capsys.readouterr()
-            assert run_command(*arguments, *changes) == 0, command
+            # Too few pixels may show no safe lift.
+            assert run_command(*arguments, *changes) in (0, NOT_SAFE), command
             if redirected:
                 Path(redirected).write_text(capsys.readouterr().out)
         case _:

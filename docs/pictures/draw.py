@@ -147,7 +147,7 @@ def concepts() -> dict[str, Image.Image]:
         first.graph, first.sphere, known.voxels, first.visited, first.candidates, config.active
     )
     paper = replace(first, decision=make_planner("attention").plan(state, np.random.default_rng(0)))
-    order = plan_order(last.graph, config)
+    order = plan_order(last.graph, config, hands=2)
     bodies = bodies_of(last.graph, true_scene_from_simulation(scene, ground_truth(scene)))
     hands = SimulatedHands(scene, config)
     taken = [hands.take(lift, bodies) for lift in order.steps]

@@ -242,6 +242,7 @@ class OrderAnswer(Document):
     """A removal order."""
 
     steps: list[Lift] = Field(description="Objects to remove, in this order")
+    probability: float = Field(description="Probability that no step moves another object")
     safe: bool = Field(description="Whether every step is safe")
     refusal: str | None = Field(description="Why no order is safe, or null")
 

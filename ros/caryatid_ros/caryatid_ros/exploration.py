@@ -186,7 +186,7 @@ class Exploration:
         reply: dict[str, Any] = {"success": False}
         try:
             with self._scene_lock:
-                scene, hands = self._known().scene, 1 if request.hands == 1 else 2
+                scene, hands = self._known().scene, request.hands or 1
                 found = plan_order(
                     scene.graph, scene.config, goal=request.goal or None, hands=hands,
                     steps=request.steps or None, seed=scene.seed, threads=cores(),

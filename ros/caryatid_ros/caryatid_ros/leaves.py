@@ -104,7 +104,7 @@ class Call(Behaviour):
 
 
 def order(client: Any, *, make: Make = make_message, **request: Any) -> Call:
-    """Plan a removal order, such as with `hands=1`; the leaf succeeds if every lift of it is safe."""
+    """Plan a removal order, such as with `hands=2`; the leaf succeeds if every lift of it is safe."""
     return Call(
         "order", client, lambda: make("caryatid_msgs/srv/Order/Request", **request),
         lambda response: response.success and response.safe,

@@ -275,7 +275,7 @@ class LiftingCommand:
 
     goal: Annotated[str | None, shown("ID")] = None
     """Object to reach; remove no more than necessary."""
-    hands: Literal[1, 2] = 2
+    hands: Literal[1, 2] = 1
     """Number of hands; with 2, one may hold an object while the other lifts one."""
     gripper: Annotated[GripperKind | None, one_of(GripperKind), default_of("gripper.kind")] = None
     """Offer only lifts with a grasp on a free path; dimensions are the settings `gripper.*`."""

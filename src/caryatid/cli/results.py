@@ -133,7 +133,7 @@ class OrderCommand(options.LiftingCommand, options.ComputingCommand):
         from caryatid.manipulation.order import plan_order
         from caryatid.runtime.parallel import cores
         from caryatid.sessions.reading import read_model
-        from caryatid.viz.tables import order_table
+        from caryatid.viz.tables import order_line, order_table
 
         config = self.settings.read(self.lift_settings())
         graph, voxels = read_model(self.run)
@@ -141,12 +141,13 @@ class OrderCommand(options.LiftingCommand, options.ComputingCommand):
         known |= {"voxels": voxels, "reachable": self.reachable(config)}
         with self.output.working("rehearsing"):
             order = plan_order(graph, config, threads=cores(), **known)
-        outcome = "a safe order" if order.safe else "no safe order"
-        goal = f" to reach {self.goal}" if self.goal else ""
-        steps = order_table(order)
+        steps = order_table(order, brief=True)
         rows = [[entry.text for entry in row] for row in steps.rows]
-        shown = table(f"{self.run}: {outcome}{goal}", steps.columns, rows)
-        self.output.result(order.to_json(), shown, f"{order.refusal}\n" if order.refusal else "")
+        jaw = f", opening {1e3 * config.gripper.opening:.0f} mm" if config.gripper.kind == "parallel" else ""
+        gripper = "" if config.gripper.kind == "none" else f" with a {config.gripper.kind} gripper{jaw}"
+        shown = table(f"Steps{gripper}", steps.columns, rows) if rows else ""
+        refusal = f"{order.refusal}\n" if order.refusal else ""
+        self.output.result(order.to_json(), f"{self.run}: {order_line(order)}\n", refusal, shown)
         return 0 if order.safe else NOT_SAFE
 
 

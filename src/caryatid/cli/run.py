@@ -265,7 +265,7 @@ class Clear(options.LiftingCommand, options.ExploringCommand):
 
     Usage examples:
       caryatid clear bridge
-      caryatid clear clutter --goal o3 --hands 1
+      caryatid clear clutter --goal o3 --hands 2
       caryatid clear scene.xml --risk 0.1 --out run
     """
 

@@ -20,7 +20,7 @@ def clear(
     take: Callable[[TakeStep], bool],
     *,
     goal: str | None = None,
-    hands: int = 2,
+    hands: int = 1,
     threads: int = 1,
     reachable: Reachable | None = None,
     past: Iterable[Step] = (),

@@ -70,7 +70,8 @@ def find_grasp(
     jaw = gripper.kind == "parallel"
     found = list(_antipodal(shape, gripper, friction) if jaw else _flat(shape, gripper))
     if not found:
-        return Blocked((), "no side fits between the fingers" if jaw else "no side is flat enough")
+        fits = f"no side fits between the fingers ({1e3 * gripper.opening:.0f} mm)"
+        return Blocked((), fits if jaw else "no side is flat enough")
     poses, widths = np.array([T for T, _ in found]), np.array([width for _, width in found])
     if reachable is not None:
         before, after = poses.copy(), poses.copy()

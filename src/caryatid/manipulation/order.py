@@ -6,9 +6,11 @@ object that does not come to rest, although the real one was at rest, has a wron
 It is held in place, and its supports are taken from the support graph alone.
 
 The risk of a lift is the probability that it disturbs another object in the next scene, such as the real one.
-After n scenes with total harm h, it is (h + ½) / (n + 1): the posterior mean with Jeffreys' prior,
-Beta(½, ½). Scenes are sampled until the risk is low enough, or can no longer become so. Objects that stand
-apart are rehearsed apart.
+After n scenes with total harm h, rehearsals put it at (h + ½) / (n + 1): the posterior mean with Jeffreys'
+prior, Beta(½, ½). The graph is a second witness: by `predict_removal`, an object moves in a share p of m
+draws. If that is more, the risk is the mean of both, weighted by n + 1 and m. If it is less, it counts for
+nothing, because only rehearsals show what a lift drags along. Scenes are sampled until the risk is low
+enough, or can no longer become so. Objects that stand apart are rehearsed apart.
 """
 
 from __future__ import annotations
@@ -27,8 +29,10 @@ from scipy.sparse.csgraph import connected_components
 
 from caryatid.config import Config, LiftConfig
 from caryatid.errors import GoalError, InputError, check_type
-from caryatid.geometry.shapes import Primitives, Shape
-from caryatid.graph import Grasp, SceneObject, SupportGraph, TakeStep
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Primitives, Shape
+from caryatid.geometry.transforms import Array
+from caryatid.graph import LIKELY, Grasp, SupportGraph, TakeStep
 from caryatid.manipulation.grasps import Blocked, find_grasp
 from caryatid.robots.arm import Reachable
 from caryatid.runtime.display import Pictured
@@ -36,9 +40,13 @@ from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.simulation.lifting import ASIDE, Lift, Lifting
 from caryatid.simulation.world import TABLE, Body, add_body, empty_spec, quaternion, strayed
 from caryatid.support.plausibility import drawn, reconcile
+from caryatid.support.relations import predict_removal
 
 BATCH = 8
 """Scenes drawn at a time [1]; how many cores there are makes no difference."""
+
+EDGE = 0.005
+"""Standard deviation of each edge of the seen table [m]: that of the registration of views."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +56,13 @@ class Order(Pictured):
     Attributes:
         steps: The objects to remove, in order.
         refusal: Why no order is safe, and which objects block each other; empty for a safe order.
+        risk: Probability that any of the lifts moves another object, from the share of the rehearsals of all
+            lifts in which one did [1].
     """
 
     steps: tuple[TakeStep, ...]
     refusal: str = ""
+    risk: float = 0.0
 
     @property
     def safe(self) -> bool:
@@ -63,9 +74,9 @@ class Order(Pictured):
         return f"Order({taken}; {self.refusal or 'safe'})"
 
     def to_json(self) -> dict[str, Any]:
-        """The steps, whether they are safe, and why not."""
-        steps = [step.to_json() for step in self.steps]
-        return {"steps": steps, "safe": self.safe, "refusal": self.refusal or None}
+        """The steps, whether they are safe, and why not; `probability` is that of the whole order."""
+        known = {"steps": [step.to_json() for step in self.steps], "probability": 1.0 - self.risk}
+        return known | {"safe": self.safe, "refusal": self.refusal or None}
 
 
 def plan_order(
@@ -73,7 +84,7 @@ def plan_order(
     config: Config | None = None,
     *,
     goal: str | None = None,
-    hands: int = 2,
+    hands: int = 1,
     steps: int | None = None,
     seed: int = 0,
     threads: int = 1,
@@ -102,9 +113,11 @@ def plan_order(
     Raises:
         GoalError: The goal is not an object of the graph.
         InputError: The graph has no support surface, no objects, or more than `rehearsal.max_objects`; or
-            there are no threads.
+            there are no threads, or hands.
     """
     check_type("graph", graph, SupportGraph, "give a SupportGraph, such as scene.graph")
+    if hands not in (1, 2):
+        raise InputError("hands", f"{hands} is neither 1 nor 2", "give the number of hands")
     if threads < 1:
         raise InputError("threads", f"{threads} is less than 1", "give the number of parallel rehearsals")
     rehearsal = _Rehearsal(graph, config or Config(), seed, threads, voxels, reachable)
@@ -116,13 +129,13 @@ def plan_order(
         wanted = _in_turn(rehearsal) if goal is None else _on_the_way(goal, rehearsal)
         trial, tried = _safest(rehearsal, wanted, hands)
         if trial is None:
-            refusal = refusal or _out_of_grasp(rehearsal, wanted)
+            refusal = refusal or _out_of_grasp(rehearsal, wanted, goal)
             break
         if trial.risk > rehearsal.accepted and not refusal:
             refusal = _refusal(trial, tried)
         found.append(_step(rehearsal, trial, left))
         rehearsal.take(trial)
-    return Order(tuple(found), refusal)
+    return Order(tuple(found), refusal, rehearsal.risk)
 
 
 def _in_turn(rehearsal: _Rehearsal) -> list[str]:
@@ -181,16 +194,17 @@ def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_
 
 
 def _step(rehearsal: _Rehearsal, trial: _Trial, left: Sequence[str]) -> TakeStep:
-    carried = [
-        s.supported
-        for s in rehearsal.graph.supports
-        if s.supporter == trial.object_id and s.supported in left
-    ]
     with_hold = f" with {', '.join(trial.hold)} held" if trial.hold else ""
-    worst = ", ".join(f"{i} with probability {share:.2f}" for i, share in trial.harmed.items())
-    why = f"disturbed {worst or 'nothing'} in {trial.rehearsals} rehearsals{with_hold}"
-    if carried:
-        why += f"; supports {', '.join(carried)}"
+    worst = ", ".join(f"{i} with probability {share:.2f}" for i, share in trial.rehearsed.items())
+    why = f"disturbed {worst or 'nothing'} in {len(trial.harm)} rehearsals{with_hold}"
+    if trial.moved:
+        moved = ", ".join(f"{i} with probability {share:.2f}" for i, share in trial.moved.items())
+        why += f"; by the graph, it moves {moved}"
+    for s in rehearsal.graph.supports:
+        if s.supporter == trial.object_id and s.supported in left:
+            stays = s.supported not in trial.hold and trial.harmed.get(s.supported, 0.0) < LIKELY
+            known = f" with probability {s.belief:.2f}, but it stays in place" if stays else ""
+            why += f"; supports {s.supported}{known}"
     grasp, safe = rehearsal.grasp(trial.object_id), trial.risk <= rehearsal.accepted
     assert not isinstance(grasp, Blocked)
     if grasp is not None:
@@ -200,11 +214,15 @@ def _step(rehearsal: _Rehearsal, trial: _Trial, left: Sequence[str]) -> TakeStep
     return TakeStep(trial.object_id, trial.hold, safe, trial.risk, why, grasp)
 
 
-def _out_of_grasp(rehearsal: _Rehearsal, wanted: Sequence[str]) -> str:
-    """Say why the gripper can grasp none of some objects."""
-    grasps = ((i, rehearsal.grasp(i)) for i in wanted)
-    reasons = "; ".join(f"{i}: {grasp.why}" for i, grasp in grasps if isinstance(grasp, Blocked))
-    return f"no object can be grasped: {reasons}"
+def _out_of_grasp(rehearsal: _Rehearsal, wanted: Sequence[str], goal: str | None) -> str:
+    """Say what can be removed, and why the gripper can grasp none of the others."""
+    reasons: dict[str, list[str]] = {}
+    for object_id in wanted:
+        if isinstance(grasp := rehearsal.grasp(object_id), Blocked):
+            reasons.setdefault(grasp.why, []).append(object_id)
+    done = len(rehearsal.ids) - len(rehearsal.left())
+    head = f"{goal} cannot be reached" if goal else f"{done} of {len(rehearsal.ids)} objects can be removed"
+    return "; ".join([head, *(f"{', '.join(ids)} cannot be grasped: {why}" for why, ids in reasons.items())])
 
 
 def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
@@ -219,15 +237,33 @@ def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
     return f"no safe order: {cycle}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class _Trial:
-    """A rehearsed lift: probability that it does harm, and the shares of rehearsals that disturbed each."""
+    """A rehearsed lift.
+
+    Attributes:
+        object_id: What is lifted.
+        hold: What is held.
+        harm: Probability (n,) that each rehearsal disturbed another object.
+        doubt: Probability that an object moves by the graph.
+        risk: Probability that the next lift disturbs another object.
+        rehearsed: Share of the rehearsals that disturbed each object, by id.
+        moved: Probability that each object moves by the graph, by id.
+    """
 
     object_id: str
     hold: tuple[str, ...]
-    rehearsals: int
+    harm: Array
+    doubt: float
     risk: float
-    harmed: dict[str, float]
+    rehearsed: dict[str, float]
+    moved: dict[str, float]
+
+    @property
+    def harmed(self) -> dict[str, float]:
+        """Probability that each object moves, by id, by the witness that says more."""
+        ids = dict.fromkeys([*self.rehearsed, *self.moved])
+        return {i: max(self.rehearsed.get(i, 0.0), self.moved.get(i, 0.0)) for i in ids}
 
 
 class _Rehearsal:
@@ -258,7 +294,7 @@ class _Rehearsal:
             raise InputError("graph", reason, "raise rehearsal.max_objects, or give a part of the scene")
         self.graph, self._config, self._seed, self._threads = graph, config, seed, threads
         self.accepted = config.rehearsal.risk
-        self._bodies: list[dict[str, Body]] = []
+        self._bodies: list[tuple[Box, dict[str, Body]]] = []
         self._scenes: dict[int, list[_DrawnScene]] = {group: [] for group in self._groups.tolist()}
         self._trials: dict[tuple[str, ...], _Trial] = {}
         self._taken: list[_Trial] = []
@@ -269,6 +305,20 @@ class _Rehearsal:
         """Ids of the objects that have not been removed yet."""
         taken = {trial.object_id for trial in self._taken}
         return [i for i in self.ids if i not in taken]
+
+    @property
+    def risk(self) -> float:
+        """Probability that any lift so far does harm, from the scenes in which all were rehearsed."""
+        if not self._taken:
+            return 0.0
+        fewest = min(len(trial.harm) for trial in self._taken)
+        harm = 1.0 - np.prod([1.0 - trial.harm[:fewest] for trial in self._taken], axis=0)
+        return self._risk(harm, 1.0 - float(np.prod([1.0 - trial.doubt for trial in self._taken])))
+
+    def _risk(self, harm: Array, moves: float) -> float:
+        """Probability of harm, from that in each of some rehearsals (n,) and that by the graph."""
+        rehearsed, draws = float(harm.sum() + 0.5) / (len(harm) + 1.0), self._config.support.draws
+        return rehearsed + draws * max(moves - rehearsed, 0.0) / (len(harm) + draws + 1.0)
 
     @cached_property
     def unstable(self) -> dict[str, float]:
@@ -311,19 +361,30 @@ class _Rehearsal:
         ids = self._near(group)
         supports = [self.graph.support(object_id, i) if i in free else None for i in ids]
         loses = np.array([0.0 if s is None else s.belief for s in supports])
+        moved = {i: p for i, p in self._moved(object_id, ids).items() if i in free}
+        doubt = max(moved.values(), default=0.0)  # What falls, falls together.
         accepted, most = self.accepted, self._config.rehearsal.draws
-        harm, harms, risk = np.zeros((0, len(ids))), 0.5, 1.0
-        while not len(harm) or (len(harm) < most and risk > accepted >= harms / (most + 1.0)):
-            scenes = slice(len(harm), len(harm) + BATCH)
-            found = self._each(
+        found, harm, risk, least = list[Array](), np.zeros(0), 1.0, 0.0
+        while not found or (len(found) < most and risk > accepted >= least):
+            scenes = slice(len(found), len(found) + BATCH)
+            found += self._each(
                 group, lambda s: np.maximum(s.lift(object_id, hold).disturbed, s.unstable * loses), scenes
             )
-            harm = np.concatenate([harm, found])
-            harms = float((1.0 - np.prod(1.0 - harm, axis=1)).sum()) + 0.5
-            risk = harms / (len(harm) + 1.0)
-        shares = zip(ids, harm.mean(axis=0).tolist(), strict=True)
-        harmed = {i: share for i, share in shares if share > 0.0}
-        return _Trial(object_id, hold, len(harm), risk, harmed)
+            harm = 1.0 - np.prod(1.0 - np.array(found), axis=1)
+            risk = self._risk(harm, doubt)
+            least = self._risk(np.concatenate([harm, np.zeros(most - len(harm))]), doubt)
+        shares = zip(ids, np.mean(found, axis=0).tolist(), strict=True)
+        rehearsed = {i: share for i, share in shares if share > 0.0}
+        return _Trial(object_id, hold, harm, doubt, risk, rehearsed, moved)
+
+    def _moved(self, object_id: str, ids: Sequence[str]) -> dict[str, float]:
+        """Probability that each of some objects moves by the graph without one of them, by id."""
+        left = set(self.left()) & set(ids)
+        objects = tuple(o for o in self.graph.objects if o.id in left or o.role == "support_surface")
+        kept = {o.id for o in objects}
+        supports = tuple(s for s in self.graph.supports if {*s.pair} <= kept)
+        effects = predict_removal(SupportGraph(objects, supports), object_id, self._config.support)
+        return {e.object_id: e.probability for e in effects}
 
     def take(self, trial: _Trial) -> None:
         """Continue without an object whose lift was tried; others that moved are put back."""
@@ -343,8 +404,8 @@ class _Rehearsal:
 
     def _draw(self, group: int, number: int) -> _DrawnScene:
         near = self._near(group)
-        bodies = {i: self._bodies[number][i] for i in near}
-        scene = _DrawnScene(self.graph.support_surface, bodies, self._config.lift)
+        table, bodies = self._bodies[number]
+        scene = _DrawnScene(table, {i: bodies[i] for i in near}, self._config.lift)
         for trial in self._taken:
             if trial.object_id in near:
                 scene.take(trial.object_id, trial.hold)
@@ -382,13 +443,12 @@ class _DrawnScene:
     as long as the highest lift takes, so that no lift is blamed for what moves by itself.
     """
 
-    def __init__(self, table: SceneObject | None, bodies: Mapping[str, Body], config: LiftConfig) -> None:
+    def __init__(self, table: Box, bodies: Mapping[str, Body], config: LiftConfig) -> None:
         self._ids, self._config = list(bodies), config
         spec = empty_spec("rehearsal")
         # Twice MuJoCo's default time step, which the implicit integrator allows, for half the time.
         spec.option.timestep = 0.004
-        if table is not None:
-            _add_table(spec, table)
+        _add_table(spec, table)
         names = [str(number) for number in range(len(bodies))]  # MuJoCo does not allow every id as a name
         for name, body in zip(names, bodies.values(), strict=True):
             add_body(spec, name, body)
@@ -425,8 +485,8 @@ class _DrawnScene:
 
 def _drawn_bodies(
     graph: SupportGraph, number: int, config: Config, rng: np.random.Generator
-) -> dict[str, Body]:
-    """Bodies of the extracted shapes or, for a number above 0, of others as likely."""
+) -> tuple[Box, dict[str, Body]]:
+    """Table, and bodies of the extracted shapes or, for a number above 0, of others as likely."""
     objects = list(graph.objects)
     if number > 0:
         objects = [drawn(o, rng, config.plausibility) for o in objects]
@@ -434,19 +494,27 @@ def _drawn_bodies(
     settings = config.support
     frictions = rng.uniform(*settings.friction, len(objects))
     densities = rng.uniform(*settings.density, len(objects))
+    edges = rng.normal(0.0, EDGE, (2, 3))
     if number == 0:
         frictions[:], densities[:] = np.mean(settings.friction), np.mean(settings.density)
+        edges[:] = 0.0
     made = zip(objects, densities, frictions, strict=True)
-    return {o.id: Body(o.shape, density, friction) for o, density, friction in made}
+    assert graph.support_surface is not None
+    table = graph.support_surface.shape
+    # The top stays; the other sides move apart.
+    edges[:, np.argmax(np.abs(table.T_world_object[2, :3]))] = 0.0
+    shift = transforms.rigid(np.eye(3), (edges[1] - edges[0]) / 2.0)
+    extents = np.maximum(table.extents + edges.sum(axis=0), EDGE)
+    return Box(table.T_world_object @ shift, extents), {
+        o.id: Body(o.shape, density, friction) for o, density, friction in made
+    }
 
 
-def _add_table(spec: Any, table: SceneObject) -> None:
-    """The table, 10 cm larger on each side than its seen part.
+def _add_table(spec: Any, table: Box) -> None:
+    """The table, as large as it was seen: what is beyond its edge falls.
 
     It is slippery: contacts use the larger friction of two, and it must not hide how slippery objects are.
     """
-    T, extents = table.shape.T_world_object, table.shape.extents
-    up = int(np.argmax(np.abs(T[2, :3])))
-    half = extents / 2.0 + np.where(np.arange(3) == up, 0.0, 0.1)
+    T = table.T_world_object
     body = spec.worldbody.add_body(name=TABLE, pos=T[:3, 3], quat=quaternion(T[:3, :3]))
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, friction=[0.1, 0.005, 0.001])
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=table.extents / 2.0, friction=[0.1, 0.005, 0.001])

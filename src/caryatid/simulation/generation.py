@@ -56,8 +56,7 @@ _Drop = tuple[Body, bool]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Plan:
-    """Setup of a scene: function that draws each object, what stands from the start (screens), size of the
-    table [m], and walls."""
+    """Setup of a scene: function that draws each object, what stands first, size of the table [m], walls."""
 
     draw: Callable[[SimulatedScene | None], _Drop]
     screens: tuple[Body, ...] = ()
@@ -299,7 +298,8 @@ def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: P
     """Whether all objects rest on the table or each other, with the firm ones, the first, about in place.
 
     An object whose middle is within a centimetre of the table's edge counts as fallen, unless it stood there
-    from the start; none may reach higher than 36 cm above the table. Setting down another one may shift the firm ones by up to 4 cm.
+    first; none may reach higher than 36 cm above the table. Setting down another one may shift the firm ones
+    by up to 4 cm.
     """
     shapes = true_shapes(scene)
     half = np.array(plan.table) / 2.0 - 0.01

@@ -102,8 +102,25 @@ def point_table(decision: Decision | None) -> Table:
     return Table.of("Points of interest", ("objects", "saliency", "reason"), rows)
 
 
-def order_table(order: Order) -> Table:
-    """Make the table of the steps of an order."""
+def order_line(order: Order) -> str:
+    """Say whether an order is safe, how probably all of it is, and what to remove."""
+    if not order.steps:
+        return "no object can be removed"
+    head, likely = "no safe order; the least risky one", f"{1.0 - order.risk:.0%}"
+    if order.safe:
+        head, likely = "safe order", f"whole order: {likely}"
+    elif all(step.safe for step in order.steps):
+        head = "safe as far as it goes"
+    taken = ", ".join(s.object_id + "".join(f" (hold {i})" for i in s.hold) for s in order.steps)
+    return f"{head} ({likely}): {taken}"
+
+
+def order_table(order: Order, *, brief: bool = False) -> Table:
+    """Make the table of the steps of an order; if brief, of those that are not alike.
+
+    Alike are safe steps with the lowest risk, without a hold or a grasp.
+    """
+    least = min((step.risk for step in order.steps), default=0.0) + 0.005
     rows = (
         (
             str(number),
@@ -113,8 +130,9 @@ def order_table(order: Order) -> Table:
             step.why,
         )
         for number, step in enumerate(order.steps, 1)
+        if not brief or step.hold or step.grasp or not step.safe or step.risk > least
     )
-    return Table.of("Steps", ("", "remove", "hold", "P(nothing else moves)", "reason"), rows)
+    return Table.of("Steps", ("", "remove", "hold", "probability", "reason"), rows)
 
 
 def size_of(shape: Shape) -> str:
