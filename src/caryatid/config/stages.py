@@ -326,8 +326,8 @@ class SupportConfig:
     """Weight of a sample for an object not at rest in it [1]: how often an unseen object supports one."""
     friction: Lengths = (0.4, 1.0)
     """Range of sliding friction that objects are sampled from [1]: wood on cardboard to rubber on glass."""
-    density: Lengths = (300.0, 1200.0)
-    """Range of density that objects are sampled from [kg/m³]: half-empty packets to full bottles."""
+    density: Lengths = (100.0, 8000.0)
+    """Range of density that objects are sampled from [kg/m³]: half-empty packets to steel."""
     touch: Positive = 0.0005
     """Standard deviation of the gap of two shapes in contact [m]; round edges, soft surfaces."""
     max_drop: NotNegative = 0.04
