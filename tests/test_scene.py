@@ -6,7 +6,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 import pytest
-from raycast import table_scene
+from raycast import TABLE, from_the_side, table_scene
 from synthetic import (
     TABLE_TOP,
     box,
@@ -30,6 +30,7 @@ from caryatid.scene import Scene
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.truth import ground_truth
+from caryatid.support.relations import predict_removal
 
 METHODS = ("pc", "sg", "pc+sg")
 
@@ -55,6 +56,39 @@ def test_a_tower_is_known_after_a_walk_around_it(tower):
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_finds_the_bridge(method):
     assert f1_of(model_of(simulated_views("bridge"), config_for(method)).graph, "bridge") >= 0.95
+
+
+def test_a_board_rests_on_the_cans_whose_upper_ends_it_hides():
+    """A ball is as near below it as what shows of the cans."""
+    graph = model_of(simulated_views("shelf", noise="carmine")).graph
+    carry = {s.supporter: s.belief for s in graph.supporters("o3")}
+    assert carry.keys() == {"o1", "o2"}
+    can = graph["o1"]
+    assert can.seen[4:] == (False, False)
+    assert can.shape.extents[2] == pytest.approx(0.13, abs=2.0 * can.uncertainty.sides[5])
+    assert 0.12 < can.shape.extents[2] < 0.15
+    assert [e.object_id for e in graph_effects(graph, "o2") if e.probability > 0.5] == ["o3", "o6", "o7"]
+
+
+def graph_effects(graph, object_id):
+    return sorted(predict_removal(graph, object_id, Config().support), key=lambda e: e.object_id)
+
+
+def test_thin_things_with_masks_lie_flat_on_the_table():
+    sizes = {1: (0.2, 0.03, 0.003), 2: (0.2, 0.02, 0.002), 3: (0.085, 0.054, 0.001), 4: (0.12, 0.12, 0.004)}
+    places = [(-0.13, -0.15), (0.13, -0.15), (-0.13, 0.1), (0.13, 0.1)]
+    boxes = [
+        (np.array([*xy, TABLE + size[2] / 2.0]), np.array(size))
+        for xy, size in zip(places, sizes.values(), strict=True)
+    ]
+    model = Scene(segmentation="labels")
+    for azimuth in (20.0, 140.0, 260.0):
+        view = table_scene(from_the_side(azimuth, 45.0, 1.2), boxes, sigma=0.0005, seed=int(azimuth))
+        model.update(view.every(2))
+    for o in model.graph.objects[1:]:
+        assert o.shape.kind == "box"
+        assert np.sort(o.shape.extents) == pytest.approx(np.sort(sizes[o.label]), abs=0.005)
+        assert o.centre_world[2] == pytest.approx(TABLE, abs=0.005)
 
 
 @pytest.mark.parametrize(("noise", "least"), [("none", 0.95), ("carmine", 0.9)])

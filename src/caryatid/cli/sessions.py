@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from caryatid.cli import options
-from caryatid.errors import needs_extra
+from caryatid.errors import InputError, needs_extra
 
 if TYPE_CHECKING:
     from caryatid.sessions import Session
@@ -140,7 +140,11 @@ class Next(SessionStep):
             if self.candidates is None:
                 view = session.next()
             else:
-                given = parse_json(CandidateViews, read_json(self.candidates), self.candidates)
+                document = read_json(self.candidates)
+                if document.keys().isdisjoint(("T_world_camera", "refused")):
+                    remedy = "give camera poses to choose from, or those that the robot refuses as 'refused'"
+                    raise InputError(self.candidates, "'T_world_camera' is missing", remedy)
+                given = parse_json(CandidateViews, document, self.candidates)
                 view = session.next(**given.arguments)
         self.output.result(view.to_json())
 

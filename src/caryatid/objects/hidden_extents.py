@@ -31,9 +31,9 @@ def complete(
 ) -> list[SceneObject]:
     """Extend the unseen lower side of each object until it meets free space, another shape or the table.
 
-    An object with a single seen side is taken to be as deep as it is wide, within the same bounds. Objects
-    are extended from the lowest up, so that those below each one are complete. Then unseen upper sides, whose
-    points end only in the shadow of what lies above, are extended to it where that is likelier than not.
+    Before, unseen upper sides, whose points end only in the shadow of what lies above, are extended to it
+    where that is likelier than not. An object with a single seen side is taken to be as deep as it is wide,
+    within the same bounds. Objects are extended from the lowest up, so that those below each one are complete.
 
     Args:
         objects: Objects without the support surface; `seen` says which sides points confirm.
@@ -41,14 +41,12 @@ def complete(
         voxels: The voxel map.
         config: Tolerances.
     """
-    done = list(objects)
+    shapes = [o.shape for o in objects]
+    done = [_raised(o, shapes[:k] + shapes[k + 1 :], voxels, config) for k, o in enumerate(objects)]
     lowest = [o.shape.surface(SPACING)[0][:, 2].min() for o in objects]
     for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
         others = [o.shape for n, o in enumerate(done) if n != k]
         done[k] = _extended(done[k], others, surface, voxels, config)
-    lower = [o.shape for o in done]
-    for k, o in enumerate(done):
-        done[k] = _raised(o, lower[:k] + lower[k + 1 :], voxels, config)
     return done
 
 

@@ -186,7 +186,7 @@ def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
         raise InputError(file, f"not a reachability map, expected format '{FORMAT}'", REMEDY)
     if np.array_equal(held.get("version", 0), 1):
         reason = "was written by an earlier caryatid, without its kind (camera or gripper) and frame"
-        raise InputError(file, reason, REMEDY)
+        raise InputError(file, reason, "sample it again and write it with write_reachability")
     if not np.array_equal(held.get("version", 0), VERSION):
         raise InputError(file, f"version {held.get('version')} is not supported, only {VERSION}", REMEDY)
     reached = held.get("reached", np.zeros(0))
