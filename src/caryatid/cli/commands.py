@@ -110,7 +110,7 @@ def _choices(hint: Any) -> dict[str, tuple[str, ...]]:
     if isinstance(hint, PrimitiveConstructorSpec):
         found[""] = hint.choices or ()
     elif get_origin(hint) is Literal:
-        found[""] = get_args(hint)
+        found[""] = tuple(map(str, get_args(hint)))
     elif isinstance(hint, type) and is_dataclass(hint):
         for name, part in get_type_hints(hint, include_extras=True).items():
             found |= {
