@@ -33,7 +33,7 @@ def complete(
 
     Before, unseen upper sides, whose points end only in the shadow of what lies above, are extended to it
     where that is likelier than not. An object with a single seen side is taken to be as deep as it is wide,
-    within the same bounds. Objects are extended from the lowest up, so that those below each one are complete.
+    within the same bounds. Objects are extended from the lowest up, so that those below are complete.
 
     Args:
         objects: Objects without the support surface; `seen` says which sides points confirm.
