@@ -28,7 +28,7 @@ def test_the_client_is_one_small_file_that_needs_nothing_but_python():
     imported = re.findall(r"^ *(?:import|from) (\w+)", text, re.M)
     assert len(imported) > 5
     assert set(imported) <= sys.stdlib_module_names
-    assert len(text.splitlines()) < 120
+    assert len(text.splitlines()) < 130
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

@@ -29,7 +29,7 @@ from caryatid.cli.commands import find_command, read_command
 from caryatid.errors import InputError, PerceptionError, in_one_line
 
 ESCAPE = "\x1b"
-QUICK = ["--set", "rehearsal.draws=2"]
+QUICK = ["--set", "rehearsal.draws=2", "--risk", "0.5"]
 STEPS = ("new", "add", "next", "graph", "undo")
 COMMANDS = [name for name in TOP if name != "session"] + [f"session {step}" for step in STEPS]
 

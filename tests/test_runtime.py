@@ -101,7 +101,7 @@ from caryatid.cli import main
 out, *small = sys.argv[1:]
 explore = ["explore", "clutter", "--segmentation", "auto", "--noise", "carmine", "--views", "3", "--quiet"]
 assert main([*explore, "--out", out, *small]) == 0
-assert main(["order", out, "--quiet", "--set", "rehearsal.draws=2"]) == 0
+assert main(["order", out, "--quiet", "--set", "rehearsal.draws=2"]) in (0, 3)
 print(json.dumps([name for name in late if name.startswith("caryatid")]))
 """
 
