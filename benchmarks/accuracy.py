@@ -192,9 +192,8 @@ def figures(rows: pd.DataFrame) -> dict[str, float]:
     """Return the means of rows, and shares of all their objects, and of their sure supports, together."""
     true, returned, matched = rows[["objects", "returned", "matched"]].sum()
     shares = {"found": matched / max(true, 1), "invented": (returned - matched) / max(returned, 1)}
-    if "forecasts" in rows:
-        sure = [right for row in rows["forecasts"] for p, right in row if p >= SURE]
-        shares["overconfident"] = 1.0 - float(np.mean(sure)) if sure else 0.0
+    sure = [right for row in rows.get("forecasts", ()) for p, right in row if p >= SURE]
+    shares["overconfident"] = 1.0 - float(np.mean(sure)) if sure else 0.0
     return rows.mean(numeric_only=True).to_dict() | shares
 
 
