@@ -233,6 +233,19 @@ def test_a_support_that_a_view_lacks_is_doubtful():
     assert support.doubtful
 
 
+@pytest.mark.parametrize("earlier", [0.95, 0.6])
+def test_a_view_that_denies_a_sure_support_is_less_sure_of_the_others(earlier):
+    def said(*supports):
+        known = [Support(*pair, probability=p) for *pair, p in supports]
+        return replace(FULL, supports=tuple(known))
+
+    views = said(("o0", "o1", 1.0), ("o1", "o2", earlier)), said(("o0", "o1", 1.0), ("o0", "o2", 1.0))
+    fused = fused_graph(views, BOTH)
+    assert edges(fused) == {("o0", "o1"), ("o0", "o2")}
+    assert fused.support("o0", "o2").doubtful == (earlier > 0.9)
+    assert fused.support("o0", "o1").belief == 1.0
+
+
 # What is a change
 
 LITTLE, MUCH = 0.8 * SG.settled, 1.2 * SG.settled

@@ -42,7 +42,7 @@ def complete(
         config: Tolerances.
     """
     shapes = [o.shape for o in objects]
-    done = [_raised(o, shapes[:k] + shapes[k + 1 :], voxels, config) for k, o in enumerate(objects)]
+    done = [_raise_upper_side(o, shapes[:k] + shapes[k + 1 :], voxels, config) for k, o in enumerate(objects)]
     lowest = [o.shape.surface(SPACING)[0][:, 2].min() for o in objects]
     for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
         others = [o.shape for n, o in enumerate(done) if n != k]
@@ -50,7 +50,7 @@ def complete(
     return done
 
 
-def _raised(
+def _raise_upper_side(
     candidate: SceneObject, others: Sequence[Shape], voxels: VoxelMap, config: CompletionConfig
 ) -> SceneObject:
     """Extend an object's unseen upper side to the shape above if that is likely; widen its uncertainty."""

@@ -125,12 +125,13 @@ class VoxelMap:
         x, y, z = (origin + self.config.size * (np.arange(count) + 0.5)
                    for origin, count in zip(self.origin_world, self.hits.shape, strict=True))  # fmt: skip
         inside = shapely.contains_xy(shapely.Polygon(outline_world[:, :2]), x[:, None], y)
-        middle = outline_world.mean(axis=0)
+        middle, layers = outline_world.mean(axis=0), int(np.searchsorted(z, outline_world[:, 2].max()))
         across = (x[:, None] - middle[0]) * normal_world[0] + (y - middle[1]) * normal_world[1]
-        heights = across[..., None] + (z - middle[2]) * normal_world[2]
+        heights = across[..., None] + (z[:layers] - middle[2]) * normal_world[2]
         below = inside[..., None] & (heights < -self.config.size / 2.0)
-        hits = np.where(below, np.uint8(0), self.hits)
-        return VoxelMap(self.origin_world, hits, np.where(below, np.uint8(1), self.passes), self.config)
+        hits, passes = self.hits.copy(), self.passes.copy()
+        hits[..., :layers][below], passes[..., :layers][below] = 0, 1
+        return VoxelMap(self.origin_world, hits, passes, self.config)
 
     def within(self, shape: Shape, points_world: Array) -> NDArray[np.bool_]:
         """Which voxels (X, Y, Z) a shape reaches into, or contain one of some points (N, 3) [m]."""

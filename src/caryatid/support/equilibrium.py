@@ -27,7 +27,7 @@ _GRAVITY = 9.81
 """[m/s²]."""
 _SOFTNESS = 1e-3
 """Share of the load by which a contact yields [1]: undetermined forces then spread evenly."""
-SIGMAS = 3.0
+_SIGMAS = 3.0
 """Standard deviations beyond which no variable is drawn [1]."""
 _SLIP = 30.0
 """How much more friction yields than pressure [1]: it carries what pressure cannot. Nothing presses
@@ -246,7 +246,7 @@ class Equilibrium:
         self._spread = np.sqrt(scatter)
         self.explained = np.zeros((count, count), dtype=np.bool_)
         for k in np.argsort(-self._gaps, kind="stable"):  # The smallest gap of a pair counts.
-            (a, b), near = self._pairs[k], abs(self._gaps[k]) <= SIGMAS * self._spread[k]
+            (a, b), near = self._pairs[k], abs(self._gaps[k]) <= _SIGMAS * self._spread[k]
             self.explained[a, b] = self.explained[b, a] = near
         self._points = np.concatenate([np.empty((0, 3)), *self.areas])
         self._contact = np.repeat(np.arange(len(self.areas)), [len(area) for area in self.areas])
@@ -274,7 +274,7 @@ class Equilibrium:
         loose = np.zeros(count, dtype=np.bool_)
         for number in range(config.draws):
             first = number == 0
-            change = np.clip(rng.standard_normal(sigma.shape), -SIGMAS, SIGMAS) * sigma * (not first)
+            change = np.clip(rng.standard_normal(sigma.shape), -_SIGMAS, _SIGMAS) * sigma * (not first)
             touching = shut > (0.5 if first else rng.random(count))
             gaps = found - np.einsum("kpv,kpv->k", rows, change[self._pairs])
             if touching.any():
