@@ -121,12 +121,10 @@ class Benchmark(options.Command):
 
         from caryatid.benchmark.episodes import short_name
         from caryatid.benchmark.running import run_locally, run_on_cluster
-        from caryatid.runtime.compiling import compile_kernels
 
         if self.scheduler is not None:
             episodes = run_on_cluster(missing, self.scheduler, self.output.say)
         else:
-            compile_kernels()
             episodes = run_locally(missing, self.jobs or os.cpu_count() or 1)
         total = len({member.episode for member in store.suites[suite]})
         console = self.output.progress
