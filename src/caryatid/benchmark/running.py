@@ -158,7 +158,12 @@ def _end_with_parent() -> None:
     """End this process as soon as its parent is gone, for any reason."""
     parent = parent_process()
     assert parent is not None
-    Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=follow, daemon=True).start()
 
 
 @contextmanager
