@@ -95,17 +95,8 @@ def change_suite(
 ) -> Suite:
     """Return a suite with other methods, conditions, settings or scenes; the rest stays.
 
-    Args:
-        suite: The suite.
-        planners: Replace its methods, each with the default fusion.
-        fusions: Fusions of each of its planners; methods that differ only in their fusion become one.
-        segmentations: Replace its conditions, together with every noise.
-        noises: Noise models of the camera.
-        preset: Settings to start from in all episodes.
-        settings: Changed in all episodes, `STAGE.NAME=VALUE`; a method's own go before.
-        scenes: Built-in names, scene folders and folders of them.
-        seeds: Number of seeds.
-        views: Views of every episode.
+    Planners replace the methods, each with the default fusion. With fusions, methods that differ only in
+    their fusion become one, with each of these. A method's own settings go before those given here.
 
     Raises:
         InputError: A setting does not exist, its value is not valid, or an option changes it; or a scene

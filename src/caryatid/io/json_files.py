@@ -67,13 +67,9 @@ def _read_numbers(shape: tuple[int, ...], rigid: bool, value: Any) -> Array:
 def parse_json(
     kind: Callable[..., T], document: Mapping[str, Any], source: str | Path, remedy: str = "correct it"
 ) -> T:
-    """Read a JSON object into a dataclass or a dict; other keys of dataclasses are ignored.
+    """Read a JSON object into a dataclass, whose fields are the keys, or a type of dict.
 
-    Args:
-        kind: A dataclass whose fields are the keys, with their types and defaults; or a type of dict.
-        document: The parsed object.
-        source: What to call it in the error.
-        remedy: What the user can do about an error.
+    Other keys of dataclasses are ignored. Errors name the source and the remedy.
 
     Raises:
         InputError: A key is missing, or a value is of another type; the sentence names the key.
