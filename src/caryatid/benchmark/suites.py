@@ -44,7 +44,6 @@ class Suite:
     """Methods × conditions × scenes × seeds.
 
     Attributes:
-        name: Its name on the command line.
         what: Its purpose, in one sentence.
         methods: The methods, each a line of a figure.
         scenes: Names of built-in scenes, or scene folders.
@@ -55,7 +54,6 @@ class Suite:
         gap: Two methods, such as random choice and the oracle, whose gap the others close in part.
     """
 
-    name: str
     what: str
     methods: Changes
     scenes: tuple[str, ...]
@@ -216,32 +214,28 @@ def _ablation(planner: str, settings: Mapping[str, str]) -> Changes:
     return {**_planners(planner), **changed}
 
 
-_ALL = (
-    Suite(
-        "smoke",
+SUITES: Mapping[str, Suite] = {
+    "smoke": Suite(
         "Whether everything runs: few scenes, few views.",
         {**_FIG5, **_planners("attention", "rear-side-voxel")},
         ("tower", "pile-6-3", "dense-10-1"),
         seeds=1,
         views=3,
     ),
-    Suite(
-        "fig5",
+    "fig5": Suite(
         "The paper's Fig. 5: fusing points, graphs or both, against random views.",
         _FIG5,
         (*DESIGNED, *PILES, *DENSE[:16]),
         views=10,
     ),
-    Suite(
-        "fig5-paper",
+    "fig5-paper": Suite(
         "The paper's Fig. 5 by the paper's own system: its preset and planner, against random views.",
         {label: {**_PAPER, **own} for label, own in _FIG5.items()},
         MIXED,
         seeds=1,
         views=10,
     ),
-    Suite(
-        "presets",
+    "presets": Suite(
         "What the departures from the paper change, over the same scenes.",
         {
             "default": {},
@@ -252,68 +246,59 @@ _ALL = (
         seeds=1,
         reference="paper",
     ),
-    Suite(
-        "planners",
+    "planners": Suite(
         "Which planner finds the support graph with the fewest views, in dense heaps.",
         {**_planners(*_PLANNERS), **_planners(*VOLUMETRIC, **_FREE)},
         DENSE,
         reference="random",
         gap=("random", "oracle"),
     ),
-    Suite(
-        "path",
+    "path": Suite(
         "How long the path is until the support graph is good, in dense heaps.",
         {**_planners("support", "random", "ring"), **_planners("proximity-count", **_FREE)},
         DENSE,
         views=10,
         reference="random",
     ),
-    Suite(
-        "ablation",
+    "ablation": Suite(
         "What the paper leaves open, one setting at a time, for the default planner.",
         {**_ablation("support", _SUPPORT), **_TOP_DOWN},
         DENSE[:16],
     ),
-    Suite(
-        "ablation-attention",
+    "ablation-attention": Suite(
         "What the paper leaves open, one setting at a time, for the planner `attention`.",
         _ablation("attention", _ATTENTION),
         DENSE[:16],
     ),
-    Suite(
-        "poses",
+    "poses": Suite(
         "Fusing points, graphs or both, with poses as reported and with registration.",
         {**_FUSED, **{f"{label}, poses as reported": {**own, **_GIVEN} for label, own in _FUSED.items()}},
         MIXED,
         seeds=1,
         views=10,
     ),
-    Suite(
-        "noise",
+    "noise": Suite(
         "What depth noise, wrong poses and automatic segments cost.",
         _planners("support", "random"),
         MIXED,
         {**_NOISE, **_AUTO},
         seeds=1,
     ),
-    Suite(
-        "house",
+    "house": Suite(
         "Household objects such as trays, bowls, mugs and bottles, with labels and without.",
         _planners("support"),
         _generated("house", 4, 12, 501, 30),
         {LABELS: {}, **_AUTO},
         seeds=1,
     ),
-    Suite(
-        "easy",
+    "easy": Suite(
         "Automatic segments of piles of 4 to 20, and of equal boxes in rows, walls and pyramids.",
         _planners("support"),
         _generated("pile", 4, 20, 800, 60) + _generated("blocks", 2, 10, 800, 40),
         _AUTO,
         seeds=1,
     ),
-    Suite(
-        "heaps",
+    "heaps": Suite(
         "Automatic segments of dense heaps, over ten views.",
         _planners("support"),
         _generated("dense", 10, 25, 700, 32),
@@ -321,8 +306,7 @@ _ALL = (
         seeds=1,
         views=10,
     ),
-    Suite(
-        "dismantle",
+    "dismantle": Suite(
         "Whether piles can be taken apart without harm after 1, 3, 5 and 10 views.",
         {order: {"order": order} for order in ORDERS},
         (*DESIGNED, *HEAPED),
@@ -330,8 +314,7 @@ _ALL = (
         views=10,
         reference="highest first",
     ),
-    Suite(
-        "full",
+    "full": Suite(
         "Every planner with every fusion under every condition; for a cluster.",
         {
             f"{planner} {label}": {"planner": planner, **own}
@@ -341,6 +324,5 @@ _ALL = (
         {"labels, no noise": {"noise": "none"}, LABELS: {}, **_NOISE, **_AUTO},
         views=10,
     ),
-)
-SUITES: Mapping[str, Suite] = {suite.name: suite for suite in _ALL}
+}
 """All suites by name."""

@@ -109,10 +109,10 @@ class Benchmark(options.Command):
             kept("finished episodes are kept; run the same command to continue"),
             ResultStore(self.out / RESULTS, code, about) as store,
         ):
-            missing = store.plan(suite.name, suite.members(), retry=self.retry) if suite else []
+            missing = store.plan(self.suite or "", suite.members(), retry=self.retry) if suite else []
             check_reference(self.reference, store)
-            if suite and missing:
-                self._run(suite.name, missing, store)
+            if self.suite and missing:
+                self._run(self.suite, missing, store)
             self._report(store)
 
     def _run(self, suite: str, missing: list[Episode], store: ResultStore) -> None:
