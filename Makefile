@@ -42,6 +42,7 @@ check: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tools/caps.py
 
 notebooks: install
 	$(BIN)/python docs/notebooks/execute.py
