@@ -118,15 +118,9 @@ class _Bag:
         if not connections:
             return
         with _damage(self.path):
-            messages = self._reader.messages(connections, *times)
-        while True:
-            with _damage(self.path):
-                item = next(messages, None)
-                if item is None:
-                    return
-                connection, received, data = item
+            for connection, received, data in self._reader.messages(connections, *times):
                 message = self._reader.deserialize(data, connection.msgtype)
-            yield connection.topic, int(received), message
+                yield connection.topic, int(received), message
 
     def images(self, topic: str, decode: Callable[[Any, str], NDArray[Any]]) -> list[TimedImage]:
         """All images of a topic, to be decoded from the message and the topic's name in errors."""

@@ -50,8 +50,10 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         except RuntimeError:
             reason = "no writable folder for compiled kernels"
             raise InputError("NUMBA_CACHE_DIR", reason, "set it to a writable folder") from None
-        used = (function.__globals__.get(name) for name in function.__code__.co_names)
-        self.stamp = self._cache_file._source_stamp, *filter(None, map(_stamp_of, used))
+        used = [function.__globals__.get(name) for name in function.__code__.co_names]
+        called = (getattr(vars(u)["_cache"], "stamp", None) for u in used if isinstance(u, Dispatcher))
+        numbers = (repr(u) for u in used if isinstance(u, (int, float, tuple, np.ndarray)))
+        self.stamp = self._cache_file._source_stamp, *called, *numbers
         self._cache_file._source_stamp = self.stamp
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -69,13 +71,6 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         """Keep a compiled kernel; two processes that write the index of a kernel at once would garble it."""
         with FileLock(Path(self.cache_path) / "kernels.lock"):
             super().save_overload(sig, data)
-
-
-def _stamp_of(used: Any) -> Any:
-    """What tells whether something that a kernel uses has changed; None for modules and functions."""
-    if isinstance(used, Dispatcher):
-        return getattr(vars(used)["_cache"], "stamp", None)
-    return repr(used) if isinstance(used, (int, float, tuple, np.ndarray)) else None
 
 
 _tell_once = cache(log.info)
