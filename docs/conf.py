@@ -32,7 +32,6 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "formulas",
     "reference",
@@ -41,7 +40,7 @@ exclude_patterns = ["_build", "gallery/*.ipynb", "gallery/*.py", "notebooks/*.py
 suppress_warnings = ["config.cache"]
 default_role = "code"
 
-myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 nb_execution_mode = "off"  # the committed notebooks contain their outputs
 nb_merge_streams = True
