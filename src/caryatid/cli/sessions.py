@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -254,7 +255,7 @@ class Serve(SessionStep):
     open_sessions: options.Count = 4
     """Number of sessions kept in memory; others are loaded on request in a tenth of a second."""
     waiting: options.Count = 16
-    """Maximum number of waiting requests; further requests get status 503."""
+    """Maximum number of requests that arrive or wait; further requests get status 503."""
     max_request: options.Count = 16
     """Maximum size of a request [MB]."""
 
@@ -275,6 +276,8 @@ class Serve(SessionStep):
             self.folder.mkdir(parents=True, exist_ok=True)
         with self.output.working("compiling"):
             compile_kernels()
-        pool = SessionPool(self.folder, config, self.open_sessions, self.waiting)
-        app = make_app(pool, token=token, max_request=self.max_request * 1_000_000, host=self.host)
-        run_service(app, self.host, self.port, listening)
+        with closing(SessionPool(self.folder, config, self.open_sessions)) as pool:
+            limits = {"max_request": self.max_request * 1_000_000, "waiting": self.waiting}
+            run_service(
+                make_app(pool, token=token, host=self.host, **limits), self.host, self.port, listening
+            )
