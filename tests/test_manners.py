@@ -23,9 +23,9 @@ from test_import import camera_file
 
 from caryatid import __version__
 from caryatid.benchmark.store import RESULTS
-from caryatid.cli import sessions
+from caryatid.cli import commands
 from caryatid.cli.commands import COMMANDS as TOP
-from caryatid.cli.commands import find_command, read_command
+from caryatid.cli.parsing import read_command
 from caryatid.errors import InputError, PerceptionError, in_one_line
 
 ESCAPE = "\x1b"
@@ -37,7 +37,7 @@ COMMANDS = [name for name in TOP if name != "session"] + [f"session {step}" for 
 def documented(command):
     """The docstring of a command."""
     name, _, step = command.partition(" ")
-    return inspect.getdoc(getattr(sessions, step.capitalize()) if step else find_command(name))
+    return inspect.getdoc(getattr(commands, step.capitalize()) if step else TOP[name])
 
 
 def examples(command):
@@ -76,7 +76,7 @@ def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, 
     assert lines[begin + 1].split()[:2] == ["caryatid", "demo"]
     for name in TOP:
         (line,) = (line for line in lines if f"• {name} " in line)
-        assert inspect.getdoc(find_command(name)).splitlines()[0][:60] in line
+        assert inspect.getdoc(TOP[name]).splitlines()[0][:60] in line
     assert "Usage examples:" not in lines
 
 
