@@ -124,18 +124,6 @@ class NewOrder(Document):
     settings: Settings = {}
 
 
-def described(name: str, session: Session) -> dict[str, Any]:
-    """Options of a session, and its numbers of views and reports."""
-    b, counts = session.beginning, {"views": session.views, "reports": session.reports}
-    return {"name": name, "segmentation": b.segmentation, "seed": b.seed, "planner": b.planner} | counts
-
-
-def state_of(session: Session) -> dict[str, Any]:
-    """Numbers of views and reports of a session, and its graph."""
-    counts = {"views": session.views, "reports": session.reports}
-    return counts | {"graph": graph_to_json(session.graph)}
-
-
 class SessionPool:
     """The sessions in one folder, each in a subfolder of its name; the most recently used ones are open."""
 
@@ -148,17 +136,6 @@ class SessionPool:
     def names(self) -> list[str]:
         """Names of all sessions."""
         return sorted(path.parent.name for path in self.folder.glob("*/session.json"))
-
-    def begin(self, name: str, config: Config, **options: Any) -> Session:
-        """Create a session; the options are those of `Session.begin`."""
-        check_limits(self.config, config)
-        self.check_room()
-        if len(self.names()) >= (most := self.config.session.max_sessions):
-            remedy = "delete folders of old sessions, or raise that setting"
-            reason = f"this service has reached session.max_sessions = {most}"
-            raise HTTPException(503, f"{reason}; {remedy}", LATER)
-        Session.begin(self.folder / name, config, **options).close()
-        return self.session(name)
 
     def session(self, name: str) -> Session:
         """Return a session, opened from disk if needed."""
@@ -264,10 +241,21 @@ def make_app(
 
 
 def _add_pages(app: FastAPI, pool: SessionPool) -> None:
+    def state(session: Session) -> dict[str, Any]:
+        graph = graph_to_json(session.graph)
+        return {"views": session.views, "reports": session.reports, "graph": graph}
+
     @app.get("/sessions")
     def list_sessions() -> dict[str, list[str]]:
         """List the sessions."""
         return {"sessions": pool.names()}
+
+    @app.get("/sessions/{name}")
+    def describe_session(name: Name) -> dict[str, Any]:
+        """Return the options of a session, and its numbers of views and reports."""
+        session = pool.session(name)
+        options = {key: getattr(session.beginning, key) for key in ("segmentation", "seed", "planner")}
+        return {"name": name} | options | {"views": session.views, "reports": session.reports}
 
     @app.post("/sessions", status_code=201)
     def begin_session(given: NewSession) -> dict[str, Any]:
@@ -276,12 +264,14 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         options = given.model_dump(include={"segmentation", "seed", "planner"})
         if given.ignore is not None:
             options["ignore"] = read_mask(given.ignore, "ignore", pool.config.recording.max_pixels)
-        return described(given.name, pool.begin(given.name, config, **options))
-
-    @app.get("/sessions/{name}")
-    def describe_session(name: Name) -> dict[str, Any]:
-        """Return the options of a session, and its numbers of views and reports."""
-        return described(name, pool.session(name))
+        check_limits(pool.config, config)
+        pool.check_room()
+        if len(pool.names()) >= (most := pool.config.session.max_sessions):
+            reason = f"this service has reached session.max_sessions = {most}"
+            remedy = "delete folders of old sessions, or raise that setting"
+            raise HTTPException(503, f"{reason}; {remedy}", LATER)
+        Session.begin(pool.folder / given.name, config, **options).close()
+        return describe_session(given.name)
 
     @app.post("/sessions/{name}/views", status_code=201)
     def add_view(name: Name, given: NewView) -> dict[str, Any]:
@@ -295,14 +285,14 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         pool.check_room()
         session = pool.session(name)
         session.take(given.object, given.T, given.number)
-        return state_of(session)
+        return state(session)
 
     @app.delete("/sessions/{name}/views/last")
     def undo_view(name: Name) -> dict[str, Any]:
         """Undo the last view, or the last report after it."""
         session = pool.session(name)
         session.undo()
-        return state_of(session)
+        return state(session)
 
     @app.get("/sessions/{name}/graph")
     def get_graph(name: Name) -> dict[str, Any]:
