@@ -194,8 +194,7 @@ def make_app(
     It takes requests of at most `max_request` bytes; at most `waiting` arrive, wait or are being processed.
     """
     bearer = HTTPBearer(auto_error=False, description="Token with which the service was started")
-    problem = {"model": dict[str, str], "description": "What is wrong, in one sentence: `detail`"}
-    problems: dict[int | str, Any] = dict.fromkeys((400, 401, 404, 408, 409, 422, 503), problem)
+    problem = {"model": dict[str, str], "content": {"text/plain": {}}, "description": "What is wrong"}
     app = FastAPI(
         title="caryatid",
         summary="Active vision sessions: add views, get the support graph and the next best view",
@@ -203,8 +202,7 @@ def make_app(
         docs_url=None,  # these pages load external scripts; /openapi.json has the same content
         redoc_url=None,
         max_body_size=max_request,
-        responses=problems
-        | {413: {"content": {"text/plain": {}}, "description": "The request is too large"}},
+        responses={"4XX": problem, "5XX": problem},
         dependencies=[] if token is None else [Depends(bearer)],  # described here, checked by `admit`
     )
     wanted = None if token is None else f"Bearer {token}".encode()
