@@ -37,6 +37,8 @@ SuiteName = Literal[
     "noise", "house", "easy", "heaps", "dismantle", "full",
 ]  # fmt: skip
 """Names of the suites; the benchmark is imported later."""
+VIEWER_PORT = 8770
+"""Default port of the viewer; if taken, the next free one."""
 Topic = Annotated[str | None, shown("TOPIC")]
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 ImagePath = Annotated[Path | None, shown("FILE")]
@@ -118,7 +120,7 @@ class View(ExploringCommand, work="run:show_run"):
     """Run, session, scene or recording."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen on; with any but 127.0.0.1, other machines can open the page by its full address."""
-    port: Natural = 8770
+    port: Natural = VIEWER_PORT
     """Port to listen on; if taken, the next free one; 0 = any free port."""
     no_browser: Flag = False
     """Print the address of the page, but do not open a browser."""

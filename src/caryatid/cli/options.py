@@ -283,9 +283,9 @@ class ExploringCommand(PlanningCommand):
     noise: NoiseModel = "carmine"
     """Noise of the simulated camera: depth noise and registration error of a Carmine, or none."""
 
-    def config(self) -> Config:
-        """All settings."""
-        return self.settings.read({"active.max_views": self.views}, takes_views=True)
+    def config(self, options: Mapping[str, object] | None = None) -> Config:
+        """All settings; `options` as for `Settings.read`."""
+        return self.settings.read({"active.max_views": self.views, **(options or {})}, takes_views=True)
 
 
 @dataclass(frozen=True, kw_only=True)

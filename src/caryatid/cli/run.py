@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from caryatid.cli import NOT_SAFE
-from caryatid.cli.commands import Clear, Demo, Explore, Extract, View
+from caryatid.cli.commands import VIEWER_PORT, Clear, Demo, Explore, Extract, View
 from caryatid.cli.output import Output, kept, profile, table
 from caryatid.cli.results import write_report
 from caryatid.config import Config
@@ -42,9 +42,6 @@ from caryatid.viz.tables import census, count_of
 if TYPE_CHECKING:
     from caryatid.viewer.page import Page, PageProcess
 
-PORT = 8770
-"""Port of the page of an exploration; if taken, the next free one."""
-
 
 def run_demo(command: Demo) -> None:
     explore_scene(Explore(**{field.name: getattr(command, field.name) for field in fields(command)}))
@@ -52,26 +49,31 @@ def run_demo(command: Demo) -> None:
 
 def explore_scene(command: Explore) -> None:
     config, looking = command.config(), command.looking
-    source, masks = _open(command, config)
-    _check_goal(command, source, config)
-    planner, camera = planner_for(command.chosen_planner, source.camera, source.truth, config, **looking)
-    steps = explore(
-        camera, source.robot, planner=planner, config=config, masks=masks, goal=command.goal,
-        until=command.until, early_stop=not command.no_early_stop, **looking,
-    )  # fmt: skip
     with _watched(command.source, config, command.output) if command.view else nullcontext() as page:
-        _record_all(command, config, source.name, steps, source.truth, page)
+        with RunWriter(command.out, config, _about(command)) as writer:
+            source, masks = _open(command, config)
+            _check_goal(command, source, config)
+            name, truth = source.name, source.truth
+            planner, camera = planner_for(command.chosen_planner, source.camera, truth, config, **looking)
+            steps = explore(
+                camera, source.robot, planner=planner, config=config, masks=masks, goal=command.goal,
+                until=command.until, early_stop=not command.no_early_stop, **looking,
+            )  # fmt: skip
+            last = _record(command, writer, name, steps, truth, page)
+        _finish(command, writer, name, last, command.goal)
 
 
 def extract_views(command: Extract) -> None:
-    config = command.settings.read(takes_views=True)
-    with command.output.working("opening"):
-        masks = command.mask_source(config)
-        steps = extract(
-            command.source, config, masks=masks, ignore=command.ignore, level=command.level,
-            label_divisor=command.label_divisor, **command.looking,
-        )  # fmt: skip
-    _record_all(command, config, Path(command.source).name, steps)
+    config, name = command.settings.read(takes_views=True), Path(command.source).name
+    with RunWriter(command.out, config, _about(command)) as writer:
+        with command.output.working("opening"):
+            masks = command.mask_source(config)
+            steps = extract(
+                command.source, config, masks=masks, ignore=command.ignore, level=command.level,
+                label_divisor=command.label_divisor, **command.looking,
+            )  # fmt: skip
+        last = _record(command, writer, name, steps)
+    _finish(command, writer, name, last)
 
 
 def show_run(command: View) -> None:
@@ -117,7 +119,7 @@ def _open_loop(command: View, config: Config) -> Page:
 
 
 def clear_table(command: Clear) -> int:
-    config, output = command.config(), command.output
+    config, output = command.config(command.lift_settings()), command.output
     reachable = command.reachable(config)
     source, masks = _open(command, config)
     camera = source.camera
@@ -237,7 +239,7 @@ def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]
     """Open a page for an exploration; after its end, keep the page open until Ctrl-C."""
     from caryatid.viewer.page import PageProcess
 
-    page = PageProcess(f"caryatid: {name}", config.support, port=PORT)
+    page = PageProcess(f"caryatid: {name}", config.support, port=VIEWER_PORT)
     output.say(f"{name} at {page.url}")
     webbrowser.open(page.url)
     try:
@@ -274,29 +276,22 @@ def _about(command: Explore | Extract | Clear) -> dict[str, Any]:
     return about
 
 
-def _record_all(
-    command: Explore | Extract,
-    config: Config,
-    name: str,
-    steps: Iterable[Step],
-    truth: TrueScene | None = None,
-    page: PageProcess | None = None,
+def _finish(
+    command: Explore | Extract, writer: RunWriter, name: str, last: Step, goal: str | None = None
 ) -> None:
-    """Save all steps, write the report and print the result."""
+    """Write the report and print the result."""
     output = command.output
-    with RunWriter(command.out, config, _about(command)) as writer:
-        last = _record(command, writer, name, steps, truth, page)
     _draw_report(command)
-    _check_found(command.goal if isinstance(command, Explore) else None, last)
+    _check_found(goal, last)
     output.say(f"{name}: {census(last.graph)} after {count_of(len(writer.steps), 'view')}")
     output.say(f"run: {command.out}" if command.no_report else f"report: {command.out / 'report.html'}")
     document: dict[str, Any] = {"run": str(command.out), "stop": last.stop}
     if last.removal is not None:
         document["removal"] = last.removal.to_json()
     document |= {"graph": graph_to_json(last.graph), "warnings": output.warnings}
-    times, shown = profile(writer.steps)
     if command.profile:
-        output.result(document | {"profile": times}, shown)
+        document["profile"], shown = profile(writer.steps)
+        output.result(document, shown)
     else:
         output.result(document, "")
 
