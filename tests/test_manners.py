@@ -25,7 +25,7 @@ from caryatid import __version__
 from caryatid.benchmark.store import RESULTS
 from caryatid.cli import commands
 from caryatid.cli.commands import COMMANDS as TOP
-from caryatid.cli.parsing import read_command
+from caryatid.cli.commands import read_command
 from caryatid.errors import InputError, PerceptionError, in_one_line
 
 ESCAPE = "\x1b"

@@ -137,6 +137,16 @@ class SessionPool:
         """Names of all sessions."""
         return sorted(path.parent.name for path in self.folder.glob("*/session.json"))
 
+    def begin(self, name: str, config: Config, **options: Any) -> None:
+        """Create a session; the options are those of `Session.begin`."""
+        check_limits(self.config, config)
+        self.check_room()
+        if len(self.names()) >= (most := self.config.session.max_sessions):
+            reason = f"this service has reached session.max_sessions = {most}"
+            remedy = "delete folders of old sessions, or raise that setting"
+            raise HTTPException(503, f"{reason}; {remedy}", LATER)
+        Session.begin(self.folder / name, config, **options).close()
+
     def session(self, name: str) -> Session:
         """Return a session, opened from disk if needed."""
         if not (self.folder / name / "session.json").is_file():
@@ -262,13 +272,7 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         options = given.model_dump(include={"segmentation", "seed", "planner"})
         if given.ignore is not None:
             options["ignore"] = read_mask(given.ignore, "ignore", pool.config.recording.max_pixels)
-        check_limits(pool.config, config)
-        pool.check_room()
-        if len(pool.names()) >= (most := pool.config.session.max_sessions):
-            reason = f"this service has reached session.max_sessions = {most}"
-            remedy = "delete folders of old sessions, or raise that setting"
-            raise HTTPException(503, f"{reason}; {remedy}", LATER)
-        Session.begin(pool.folder / given.name, config, **options).close()
+        pool.begin(given.name, config, **options)
         return describe_session(given.name)
 
     @app.post("/sessions/{name}/views", status_code=201)

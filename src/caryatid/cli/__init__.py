@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if arguments in (["--version"], ["-V"], ["version"]):
             sys.stdout.write(f"caryatid {__version__}\n")
             return 0
-        from caryatid.cli.parsing import read_command
+        from caryatid.cli.commands import read_command
 
         command = read_command(arguments)
         debug = command.general.debug

@@ -1,35 +1,24 @@
-"""All commands: help, options, and the name of the function that runs each, which is imported late."""
+"""All commands: help, options, and the function that runs each, imported late; and how tyro parses them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import inspect
+import io
+import os
+import re
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stdout, suppress
+from dataclasses import asdict, dataclass, is_dataclass, make_dataclass
+from difflib import get_close_matches
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
+from tyro.constructors import PrimitiveConstructorSpec
 
-from caryatid.cli.options import (
-    Command,
-    ComputingCommand,
-    Count,
-    ExploringCommand,
-    Flag,
-    General,
-    LiftingCommand,
-    LookingCommand,
-    Modelling,
-    Natural,
-    OutPath,
-    PlanningCommand,
-    RunPath,
-    Settings,
-    Several,
-    SourceName,
-    Words,
-    default_of,
-    planner_name,
-    shown,
-)  # fmt: skip
+from caryatid.cli import options
 from caryatid.config.choices import ExportFormat, FusionMethod, NoiseModel, Preset, SegmentationMethod
 
 SuiteName = Literal[
@@ -39,25 +28,25 @@ SuiteName = Literal[
 """Names of the suites; the benchmark is imported later."""
 VIEWER_PORT = 8770
 """Default port of the viewer; if taken, the next free one."""
-Topic = Annotated[str | None, shown("TOPIC")]
+Topic = Annotated[str | None, options.shown("TOPIC")]
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-ImagePath = Annotated[Path | None, shown("FILE")]
+ImagePath = Annotated[Path | None, options.shown("FILE")]
 
 
-class RunCommand(ComputingCommand):
+class RunCommand(options.ComputingCommand):
     """A command that writes a run folder."""
 
     source: str
-    settings: Modelling = Modelling()
-    out: OutPath = Path("run")
+    settings: options.Modelling = options.Modelling()
+    out: options.OutPath = Path("run")
     """Run folder to write; replaces an existing run."""
-    no_report: Flag = False
+    no_report: options.Flag = False
     """Do not write report.html."""
-    profile: Flag = False
+    profile: options.Flag = False
     """Print the time of each stage; with --json, add it to the document."""
 
 
-class Explore(RunCommand, ExploringCommand, work="run:explore_scene"):
+class Explore(RunCommand, options.ExploringCommand, work="run:explore_scene"):
     """Explore a scene view by view and infer which object supports which.
 
     SOURCE is one of:
@@ -73,15 +62,15 @@ class Explore(RunCommand, ExploringCommand, work="run:explore_scene"):
       caryatid explore recording/ --segmentation auto --out run
     """
 
-    source: SourceName
+    source: options.SourceName
     """Scene or recording."""
-    no_early_stop: Flag = False
+    no_early_stop: options.Flag = False
     """Continue to the maximum number of views, even if no view is worth its path."""
-    goal: Annotated[str | None, shown("ID")] = None
+    goal: Annotated[str | None, options.shown("ID")] = None
     """Object to remove: explore only what matters for it, and stop when it is clear what else would move."""
-    until: Annotated[float | None, shown("P", "0.95 with --goal, else never")] = None
+    until: Annotated[float | None, options.shown("P", "0.95 with --goal, else never")] = None
     """Stop when every support (with --goal, every effect of the removal) is known with this probability."""
-    view: Flag = False
+    view: options.Flag = False
     """Show the exploration in the browser; Ctrl-C closes the page."""
 
 
@@ -95,13 +84,13 @@ class Demo(RunCommand, work="run:run_demo"):
 
     source: Annotated[str, tyro.conf.arg(name="scene", metavar="NAME")] = "clutter"
     """Built-in scene, such as tower, bridge or dense-12-0."""
-    views: Annotated[Count | None, default_of("active.max_views")] = None
+    views: Annotated[options.Count | None, options.default_of("active.max_views")] = None
     """Maximum number of views, including the first."""
-    view: Flag = False
+    view: options.Flag = False
     """Show the exploration in the browser; Ctrl-C closes the page."""
 
 
-class View(ExploringCommand, work="run:show_run"):
+class View(options.ExploringCommand, work="run:show_run"):
     """Show a finished run in the browser, or explore a scene or recording interactively.
 
     SOURCE is one of:
@@ -116,17 +105,17 @@ class View(ExploringCommand, work="run:show_run"):
       caryatid view recording/ --segmentation auto --port 8080 --no-browser
     """
 
-    source: SourceName
+    source: options.SourceName
     """Run, session, scene or recording."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen on; with any but 127.0.0.1, other machines can open the page by its full address."""
-    port: Natural = VIEWER_PORT
+    port: options.Natural = VIEWER_PORT
     """Port to listen on; if taken, the next free one; 0 = any free port."""
-    no_browser: Flag = False
+    no_browser: options.Flag = False
     """Print the address of the page, but do not open a browser."""
 
 
-class Extract(RunCommand, LookingCommand, work="run:extract_views"):
+class Extract(RunCommand, options.LookingCommand, work="run:extract_views"):
     """Extract shapes and a support graph from all views of a recording, or from one cloud.
 
     Usage examples:
@@ -134,15 +123,15 @@ class Extract(RunCommand, LookingCommand, work="run:extract_views"):
       caryatid extract table.pcd --segmentation auto --out run
     """
 
-    source: SourceName
+    source: options.SourceName
     """Recording (folder in the BOP format) or cloud (.pcd, .ply)."""
-    label_divisor: Count = 1
+    label_divisor: options.Count = 1
     """For clouds with labels of object parts: object = label // N."""
-    level: Flag = False
+    level: options.Flag = False
     """Rotate the world frame of a recording so that the table is level; use it if z does not point up."""
 
 
-class Clear(LiftingCommand, ExploringCommand, work="run:clear_table"):
+class Clear(options.LiftingCommand, options.ExploringCommand, work="run:clear_table"):
     """Clear a simulated table: look until the next lift is safe, remove the object, look again.
 
     Objects are lifted straight up, one by one. A lift disturbs another object if it moves that object by
@@ -156,15 +145,15 @@ class Clear(LiftingCommand, ExploringCommand, work="run:clear_table"):
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Built-in or MJCF scene."""
-    out: OutPath = Path("run")
+    out: options.OutPath = Path("run")
     """Run folder to write, view by view; replaces an existing run, or continues it if interrupted."""
-    views: Annotated[Count | None, default_of("active.max_views")] = None
+    views: Annotated[options.Count | None, options.default_of("active.max_views")] = None
     """Maximum number of views before each lift."""
-    no_report: Flag = False
+    no_report: options.Flag = False
     """Do not write report.html."""
 
 
-class Import(Command, work="results:import_log"):
+class Import(options.Command, work="results:import_log"):
     """Convert a robot's log to a recording: sharp views from different viewpoints, with their poses.
 
     Read bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), or a folder of the
@@ -176,7 +165,7 @@ class Import(Command, work="results:import_log"):
       caryatid import rgbd_dataset_freiburg1_desk --out desk
     """
 
-    settings: Settings = Settings()
+    settings: options.Settings = options.Settings()
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """Bag, or TUM RGB-D folder with depth.txt."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
@@ -187,17 +176,17 @@ class Import(Command, work="results:import_log"):
     """CameraInfo of the depth images."""
     rgb: Topic = None
     """Colour images that depth is registered to; also used to pick sharp frames."""
-    tf: Annotated[str | None, shown("FRAME")] = None
+    tf: Annotated[str | None, options.shown("FRAME")] = None
     """World frame with z up, such as map or base_link. If omitted, import one frame without a pose."""
-    camera: Annotated[Path | None, shown("FILE.json")] = None
+    camera: Annotated[Path | None, options.shown("FILE.json")] = None
     """Intrinsics of a TUM RGB-D folder: fx, fy, cx, cy [px]. If omitted, the published values."""
-    level: Flag = False
+    level: options.Flag = False
     """Rotate the world frame so that z points up from the table, which most views must show."""
-    views: Annotated[Count | None, default_of("recording.max_views")] = None
+    views: Annotated[options.Count | None, options.default_of("recording.max_views")] = None
     """Maximum number of views."""
 
 
-class Evaluate(Command, work="results:print_scores"):
+class Evaluate(options.Command, work="results:print_scores"):
     """Score each view of a run: precision, recall and F1 of vertices and edges, mean IoU, probabilities.
 
     Brier score (0 is perfect) and average precision (1 is perfect) rate the probabilities of supports
@@ -208,13 +197,13 @@ class Evaluate(Command, work="results:print_scores"):
       caryatid evaluate run scenes/tower
     """
 
-    run: RunPath
+    run: options.RunPath
     """Run folder or session."""
-    truth: Annotated[str | None, tyro.conf.Positional, shown("[GT]", "the run's source")] = None
+    truth: Annotated[str | None, tyro.conf.Positional, options.shown("[GT]", "the run's source")] = None
     """Scene (built-in name, scene.xml or its folder), or a recording with masks and gt.json."""
 
 
-class Order(LiftingCommand, ComputingCommand, work="results:find_order"):
+class Order(options.LiftingCommand, options.ComputingCommand, work="results:find_order"):
     """Find a safe order in which to remove all objects, or to reach one.
 
     Rehearse each lift in physics, on the extracted shapes and on samples of their uncertainty, to estimate
@@ -227,12 +216,12 @@ class Order(LiftingCommand, ComputingCommand, work="results:find_order"):
       caryatid order run --risk 0.2
     """
 
-    settings: Modelling = Modelling()
-    run: RunPath
+    settings: options.Modelling = options.Modelling()
+    run: options.RunPath
     """Run folder, session, or graph.json."""
 
 
-class Report(Command, work="results:redraw_report"):
+class Report(options.Command, work="results:redraw_report"):
     """Write the report of a run again, optionally also as a PDF.
 
     Usage examples:
@@ -240,13 +229,13 @@ class Report(Command, work="results:redraw_report"):
       caryatid report run --pdf report.pdf
     """
 
-    run: RunPath
+    run: options.RunPath
     """Run folder or session; its report.html is replaced."""
-    pdf: Annotated[Path | None, shown("FILE.pdf")] = None
+    pdf: Annotated[Path | None, options.shown("FILE.pdf")] = None
     """Also write a PDF (A4); replaces an existing file."""
 
 
-class Export(Command, work="results:export_model"):
+class Export(options.Command, work="results:export_model"):
     """Export the scene model of a run to simulators, 3D viewers and graph tools.
 
     Usage examples:
@@ -254,16 +243,16 @@ class Export(Command, work="results:export_model"):
       caryatid export run --out scene.glb
     """
 
-    settings: Settings = Settings()
-    run: RunPath
+    settings: options.Settings = options.Settings()
+    run: options.RunPath
     """Run folder, session, or graph.json."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """File to write: .xml (mjcf), .urdf, .glb, .gltf, .graphml, .dot or .gv; replaces an existing file."""
-    format: Annotated[ExportFormat | None, shown(default="by the suffix of FILE")] = None
+    format: Annotated[ExportFormat | None, options.shown(default="by the suffix of FILE")] = None
     """mjcf: free bodies on a table; urdf: links fixed to the world; gltf: meshes; graphml, dot: the graph."""
 
 
-class Benchmark(Command, work="benchmark:compare_methods"):
+class Benchmark(options.Command, work="benchmark:compare_methods"):
     """Compare methods over scenes and seeds, and draw figures.
 
     Finished episodes are kept: stop at any time, and run the same command to continue. Without --suite,
@@ -278,46 +267,46 @@ class Benchmark(Command, work="benchmark:compare_methods"):
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder of the results; existing results are reused."""
-    suite: Annotated[SuiteName | None, shown()] = None
+    suite: Annotated[SuiteName | None, options.shown()] = None
     """Suite of methods, scenes and conditions to run."""
-    scenes: Annotated[Words, shown("SCENE")] = ()
+    scenes: Annotated[options.Words, options.shown("SCENE")] = ()
     """Replace the suite's scenes: a built-in name, a scene folder, or a folder of those; may be repeated."""
-    planner: Several[Annotated[str, planner_name()]] = ()
+    planner: options.Several[Annotated[str, options.planner_name()]] = ()
     """Replace the suite's planners; may be repeated. The first is the reference for the others."""
-    fusion: Several[FusionMethod] = ()
+    fusion: options.Several[FusionMethod] = ()
     """Replace the suite's fusion; may be repeated."""
-    segmentation: Several[SegmentationMethod] = ()
+    segmentation: options.Several[SegmentationMethod] = ()
     """Replace the suite's segmentation; may be repeated. Default: labels."""
-    noise: Several[NoiseModel] = ()
+    noise: options.Several[NoiseModel] = ()
     """Replace the suite's camera noise; may be repeated. Default: carmine."""
-    preset: Annotated[Preset | None, shown(default="the suite's")] = None
+    preset: Annotated[Preset | None, options.shown(default="the suite's")] = None
     """Settings to start from in all episodes: caryatid's defaults, or those of the paper."""
-    set: Annotated[Words, shown("STAGE.NAME=VALUE")] = ()
+    set: Annotated[options.Words, options.shown("STAGE.NAME=VALUE")] = ()
     """Change one setting of all episodes, such as `--set noise.translation=0.02`; may be repeated."""
-    seeds: Annotated[Count | None, shown(default="the suite's")] = None
+    seeds: Annotated[options.Count | None, options.shown(default="the suite's")] = None
     """Number of seeds; every episode runs with seeds 0 to N−1."""
-    views: Annotated[Count | None, shown(default="the suite's")] = None
+    views: Annotated[options.Count | None, options.shown(default="the suite's")] = None
     """Number of views of every episode, including the first."""
-    jobs: Annotated[Count | None, shown(default="all cores")] = None
+    jobs: Annotated[options.Count | None, options.shown(default="all cores")] = None
     """Number of processes."""
-    scheduler: Annotated[str | None, shown("ADDRESS")] = None
+    scheduler: Annotated[str | None, options.shown("ADDRESS")] = None
     """Run on the workers of this dask.distributed scheduler, such as tcp://10.0.0.5:8786."""
-    retry: Flag = False
+    retry: options.Flag = False
     """Run failed episodes again."""
-    reference: Annotated[str | None, shown("METHOD")] = None
+    reference: Annotated[str | None, options.shown("METHOD")] = None
     """Reference method in the figures, instead of the suite's."""
-    docs: Annotated[Path | None, shown("FILE.md")] = None
+    docs: Annotated[Path | None, options.shown("FILE.md")] = None
     """Also write the results as a Markdown document."""
 
 
-class SessionStep(ComputingCommand):
+class SessionStep(options.ComputingCommand):
     """A command on a session."""
 
     folder: Folder
     """Folder of the session."""
 
 
-class New(SessionStep, PlanningCommand, work="sessions:begin_session"):
+class New(SessionStep, options.PlanningCommand, work="sessions:begin_session"):
     """Create a session in a new folder.
 
     Usage examples:
@@ -350,7 +339,7 @@ class Add(SessionStep, work="sessions:add_view"):
     """Colour image: PNG, JPEG or .npy."""
     labels: ImagePath = None
     """Object number of each pixel: grey PNG or .npy; 0 = no object. An object has one number in all views."""
-    number: Annotated[int | None, shown("N")] = None
+    number: Annotated[int | None, options.shown("N")] = None
     """Number of the view, from 0; makes a repeated command safe: an existing view is not added again."""
 
 
@@ -365,7 +354,7 @@ class Next(SessionStep, work="sessions:plan_view"):
       caryatid session next table --candidates candidates.json
     """
 
-    candidates: Annotated[Path | None, shown("C.json")] = None
+    candidates: Annotated[Path | None, options.shown("C.json")] = None
     """Candidate poses to choose from, instead of those that the session's robot reaches; or poses to omit."""
 
 
@@ -389,9 +378,9 @@ class Take(SessionStep, work="sessions:report_change"):
 
     object: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ID")]
     """ID of the object."""
-    moved: Annotated[Path | None, shown("T.json")] = None
+    moved: Annotated[Path | None, options.shown("T.json")] = None
     """The object's motion. If omitted, the object was removed."""
-    number: Annotated[int | None, shown("N")] = None
+    number: Annotated[int | None, options.shown("N")] = None
     """Number of the report, from 0; makes a repeated command safe: the newest report is not repeated."""
 
 
@@ -413,7 +402,7 @@ class Session:
     step: New | Add | Next | Graph | Take | Undo
 
     @property
-    def general(self) -> General:
+    def general(self) -> options.General:
         """Output options of the step."""
         return self.step.general
 
@@ -433,24 +422,24 @@ class Serve(SessionStep, work="sessions:serve_sessions"):
       CARYATID_TOKEN=$(openssl rand -hex 16) caryatid serve sessions --host 0.0.0.0
     """
 
-    settings: Settings = Settings()
+    settings: options.Settings = options.Settings()
     folder: Folder
     """Folder of the sessions; created if missing."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen on."""
-    port: Natural = 8765
+    port: options.Natural = 8765
     """Port to listen on; 0 = any free port."""
-    token: Annotated[str | None, shown("TOKEN")] = None
+    token: Annotated[str | None, options.shown("TOKEN")] = None
     """Token that requests must send; prefer CARYATID_TOKEN, which process lists do not show."""
-    open_sessions: Count = 4
+    open_sessions: options.Count = 4
     """Number of sessions kept in memory; others are loaded on request in a tenth of a second."""
-    waiting: Count = 16
+    waiting: options.Count = 16
     """Maximum number of requests that arrive or wait; further requests get status 503."""
-    max_request: Count = 16
+    max_request: options.Count = 16
     """Maximum size of a request [MB]."""
 
 
-class Scenes(Command, work="parsing:print_scenes"):
+class Scenes(options.Command, work="commands:print_scenes"):
     """List the built-in scenes and the sample recordings.
 
     Usage examples:
@@ -458,17 +447,17 @@ class Scenes(Command, work="parsing:print_scenes"):
     """
 
 
-class Config(Command, work="parsing:print_config"):
+class Config(options.Command, work="commands:print_config"):
     """Print all settings as TOML, to edit and pass to --config.
 
     Usage examples:
       caryatid config > settings.toml
     """
 
-    settings: Modelling = Modelling()
+    settings: options.Modelling = options.Modelling()
 
 
-class Completion(Command, work="parsing:print_completion"):
+class Completion(options.Command, work="commands:print_completion"):
     """Print a shell completion script for commands, options, scenes, settings and files.
 
     Usage examples:
@@ -483,7 +472,7 @@ class Completion(Command, work="parsing:print_completion"):
     """Shell to print the script for."""
 
 
-COMMANDS: dict[str, type[Command | Session]] = {
+COMMANDS: dict[str, type[options.Command | Session]] = {
     command.__name__.lower(): command
     for command in (
         Demo, Explore, Extract, View, Evaluate, Order, Clear, Import, Report, Export, Benchmark, Session,
@@ -491,3 +480,152 @@ COMMANDS: dict[str, type[Command | Session]] = {
     )
 }  # fmt: skip
 """The commands in the order of the help."""
+
+DESCRIPTION = """Explore a cluttered table and find out which object supports which.
+
+Get started:
+  caryatid demo                  explore a built-in table in simulation
+  caryatid view clutter          watch an exploration in the browser, view by view
+  caryatid explore tower         explore another built-in scene, or your own scene or recording
+  caryatid extract sample-cloud  process one cloud, or all views of a recording
+  caryatid order run             find a safe order in which to remove the objects of a run
+  caryatid COMMAND --help        show what a command does, its options, and examples
+"""
+"""Text at the top of the help."""
+
+MARKERS = (
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.HelptextFromCommentsOff,
+    tyro.conf.OmitArgPrefixes,
+    tyro.conf.OmitSubcommandPrefixes,
+)
+"""How tyro turns fields into options."""
+
+
+def read_command(arguments: Sequence[str]) -> Any:
+    """Parse the arguments into a command that is ready to be called.
+
+    Raises:
+        SystemExit: After --help, with 0; on wrong options, with 2.
+    """
+    shown = sys.stdout.isatty() and sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+    tyro._experimental_options["ansi_codes"] = shown
+    if list(arguments[:1]) in ([], ["help"]):
+        arguments = [*arguments[1:], "--help"]
+    name, *words = arguments
+    try:
+        if name in COMMANDS:
+            return _parse(COMMANDS[name], f"caryatid {name}", words)
+        return _parse(_any_command(), "caryatid", arguments).command
+    except SystemExit as end:
+        if end.code:
+            _suggest(name, words)
+        raise
+
+
+def _parse(kind: Any, program: str, arguments: Sequence[str]) -> Any:
+    description = None if kind in COMMANDS.values() else DESCRIPTION
+    return tyro.cli(
+        kind, prog=program, description=description, args=arguments, config=MARKERS, registry=options.REGISTRY
+    )
+
+
+def _suggest(name: str, words: Sequence[str]) -> None:
+    """Print the command or the value of an option that a mistyped one resembles."""
+    pairs = pairwise(words) if name in COMMANDS else [("", name)]
+    choices = _choices(COMMANDS[name]) if name in COMMANDS else {"": list(COMMANDS)}
+    for option, word in pairs:
+        known = choices.get(option, []) if not word.startswith("-") else []
+        if word not in known and (meant := get_close_matches(word, known, 1)):
+            sys.stderr.write(f"Did you mean {meant[0]}?\n")
+
+
+def _choices(kind: Any, option: str = "") -> dict[str, list[str]]:
+    """The words that each option of a command chooses from; `kind` is its type, or that of an option."""
+    if isinstance(kind, PrimitiveConstructorSpec):
+        return {option: list(kind.choices or ())}
+    if get_origin(kind) is Literal:
+        return {option: [str(word) for word in get_args(kind)]}
+    if isinstance(kind, type) and is_dataclass(kind):
+        hints = get_type_hints(kind, include_extras=True)
+        parts = [(part, f"--{name.replace('_', '-')}") for name, part in hints.items()]
+    else:
+        parts = [(part, option) for part in (*get_args(kind), *getattr(kind, "__metadata__", ()))]
+    return {name: words for part in parts for name, words in _choices(*part).items()}
+
+
+def _any_command() -> Any:
+    """The type of all commands, each with the first line of its help."""
+    subcommands = []
+    for name, command in COMMANDS.items():
+        summary = (inspect.getdoc(command) or "").partition("\n")[0]
+        spec = tyro.conf.subcommand(name, constructor=command, description=summary)
+        subcommands.append(Annotated[Any, spec])
+    # Where there is no help text, tyro looks for one in the sources of `typing`, which takes long.
+    chosen: Any = Annotated[Union[tuple(subcommands)], tyro.conf.arg(help="")]  # noqa: UP007
+    version: Any = Annotated[bool, tyro.conf.arg(help="Print the version.", help_behavior_hint="")]
+    return make_dataclass("Caryatid", [("command", chosen), ("version", version, False)])
+
+
+def print_scenes(command: Scenes) -> None:
+    from caryatid.cli.output import table
+    from caryatid.io.datasets import DESCRIPTIONS
+    from caryatid.simulation.scenes import list_scenes
+
+    scenes, columns = list_scenes(), ("name", "description")
+    shown = table("Built-in scenes", columns, scenes.items()), table("Samples", columns, DESCRIPTIONS.items())
+    command.output.result({"scenes": scenes, "samples": DESCRIPTIONS}, *shown)
+
+
+def print_config(command: Config) -> None:
+    from caryatid.config.settings import write_settings
+
+    config = command.settings.read()
+    command.output.result(asdict(config), write_settings(config))
+
+
+OFFERS = """
+
+def offer_values(command, names):
+    for option in command['options']:
+        if '--set' in option['flags']:
+            option.update(type='choice', choices=SETTINGS)
+    for name, child in command['subcommands'].items():
+        offer_values(child, [])
+    command['subcommands'].update((name, dict(command, subcommands={})) for name in names)
+
+for name, command in COMPLETION_SPEC['subcommands'].items():
+    offer_values(command, SOURCES.get(name, []))
+"""
+"""What tyro's script does not know: settings and sources. Fish quotes it: no double quote, backslash or $."""
+FILES = {
+    "get_completions(words, current_index, COMPLETION_SPEC)  #": (
+        "get_completions(words, current_index, COMPLETION_SPEC) or ['__TYRO_COMPLETE_FILES__']  #"
+    ),
+    'compgen -f -- "$cur"': 'compgen -f -- "${COMP_WORDS[COMP_CWORD]}"',
+    '  COMPREPLY=("${matches[@]}")\n': (
+        '  COMPREPLY=("${matches[@]}")\n'
+        '  if [[ "${COMPREPLY[0]}" == *= ]]; then compopt -o nospace 2> /dev/null; fi\n'
+    ),
+}
+"""Changes to tyro's script: files wherever nothing else is known, and no space after a setting's =."""
+
+
+def print_completion(command: Completion) -> None:
+    from caryatid.config import Config as AllSettings
+    from caryatid.io.datasets import DESCRIPTIONS
+    from caryatid.simulation.scenes import DESIGNED
+
+    script = io.StringIO()
+    with redirect_stdout(script), suppress(SystemExit):
+        _parse(_any_command(), "caryatid", ["--tyro-write-completion", command.shell, "-"])
+    settings = [f"{stage}.{name}=" for stage, values in asdict(AllSettings()).items() for name in values]
+    both = [*DESIGNED, *(name for name in DESCRIPTIONS if "recording" in name)]
+    sources = {"explore": both, "view": both, "clear": [*DESIGNED], "extract": [*DESCRIPTIONS]}
+    offers = OFFERS.replace("SETTINGS", repr(settings)).replace("SOURCES", repr(sources))
+    known = re.sub(
+        "^COMPLETION_SPEC = .*", lambda line: line[0] + offers, script.getvalue(), flags=re.MULTILINE
+    )
+    for old, new in FILES.items():
+        known = known.replace(old, new)
+    command.output.result({"shell": command.shell, "script": known}, known)
