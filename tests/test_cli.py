@@ -164,11 +164,6 @@ def test_scenes_and_samples_are_listed_and_a_name_spelt_wrong_is_guessed(tmp_pat
     assert "did you mean tower?" in capsys.readouterr().err
 
 
-def test_without_a_command_it_shows_how_to_start(capsys):
-    assert run_command() == 0
-    assert "caryatid demo" in capsys.readouterr().out
-
-
 def test_a_run_is_scored_against_the_ground_truth_of_its_source_or_of_a_place(
     tmp_path, kept_run, scene_file, capsys, monkeypatch
 ):

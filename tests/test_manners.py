@@ -23,9 +23,9 @@ from test_import import camera_file
 
 from caryatid import __version__
 from caryatid.benchmark.store import RESULTS
-from caryatid.cli import sessions
+from caryatid.cli import commands
 from caryatid.cli.commands import COMMANDS as TOP
-from caryatid.cli.commands import find_command, read_command
+from caryatid.cli.commands import read_command
 from caryatid.errors import InputError, PerceptionError, in_one_line
 
 ESCAPE = "\x1b"
@@ -37,7 +37,7 @@ COMMANDS = [name for name in TOP if name != "session"] + [f"session {step}" for 
 def documented(command):
     """The docstring of a command."""
     name, _, step = command.partition(" ")
-    return inspect.getdoc(getattr(sessions, step.capitalize()) if step else find_command(name))
+    return inspect.getdoc(getattr(commands, step.capitalize()) if step else TOP[name])
 
 
 def examples(command):
@@ -70,14 +70,23 @@ def test_help_is_clean_and_its_examples_are_commands(command, capsys, monkeypatc
 
 def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")
-    assert run_command("--help") == 0
-    lines = capsys.readouterr().out.splitlines()
+
+    def said(words):
+        assert run_command(*words.split()) == 0
+        return capsys.readouterr().out
+
+    text = said("--help")
+    assert text == said("help") == said("")
+    assert said("explore --help") == said("help explore")
+    lines = text.splitlines()
     begin = lines.index("Get started:")
     assert lines[begin + 1].split()[:2] == ["caryatid", "demo"]
     for name in TOP:
         (line,) = (line for line in lines if f"• {name} " in line)
-        assert inspect.getdoc(find_command(name)).splitlines()[0][:60] in line
+        assert inspect.getdoc(TOP[name]).splitlines()[0][:60] in line
     assert "Usage examples:" not in lines
+    assert "Print the version." in text
+    assert said("--version") == said("-V") == said("version") == f"caryatid {__version__}\n"
 
 
 @pytest.mark.parametrize(
@@ -109,22 +118,6 @@ def test_a_usage_error_is_short_and_names_the_remedy(words, said, capsys, monkey
     assert captured.out == ""
     assert said in captured.err
     assert len(captured.err.splitlines()) < 20
-
-
-def test_version_prints_the_version(capsys):
-    for word in ("--version", "-V", "version"):
-        assert run_command(word) == 0
-        assert capsys.readouterr().out == f"caryatid {__version__}\n"
-
-
-def test_help_can_be_asked_for_by_a_word(capsys):
-    texts = []
-    for words in ("--help", "help", "explore --help", "help explore"):
-        assert run_command(*words.split()) == 0
-        texts.append(capsys.readouterr().out)
-    assert texts[0] == texts[1]
-    assert "Print the version." in texts[0]
-    assert texts[2] == texts[3]
 
 
 # --json

@@ -43,7 +43,7 @@ def operations(tmp_path_factory, views):
     with Session.begin(folder / "table") as session:
         for view in views[:2]:
             session.add(view)
-    app = make_app(SessionPool(folder, Config(), 2, 8), token=TOKEN, max_request=1_000_000)
+    app = make_app(SessionPool(folder, Config(), 2), token=TOKEN, max_request=1_000_000, waiting=8)
     page = schemathesis.openapi.from_asgi("/openapi.json", app, headers=HEADERS)
     return [operation.ok() for operation in page.get_all_operations()]
 

@@ -25,10 +25,7 @@ INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status.
-
-    Args:
-        arguments: The command and its options; None takes them from the command line.
+    """Run one command, by default that of the command line, and return its exit status.
 
     Returns:
         0 done, 1 bad input, failed work or a closed pipe, 3 no safe order, 4 goal not found, 130 interrupted.

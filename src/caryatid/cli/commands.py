@@ -1,4 +1,4 @@
-"""All commands by name, the parsing of the command line, and the commands that only print text."""
+"""All commands: help, options, and the function that runs each, imported late; and how tyro parses them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,474 @@ from contextlib import redirect_stdout, suppress
 from dataclasses import asdict, dataclass, is_dataclass, make_dataclass
 from difflib import get_close_matches
 from itertools import pairwise
-from pkgutil import resolve_name
+from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from caryatid.cli.options import Command, Modelling
+from caryatid.cli import options
+from caryatid.config.choices import ExportFormat, FusionMethod, NoiseModel, Preset, SegmentationMethod
+
+SuiteName = Literal[
+    "smoke", "fig5", "fig5-paper", "presets", "planners", "path", "ablation", "ablation-attention", "poses",
+    "noise", "house", "easy", "heaps", "dismantle", "full",
+]  # fmt: skip
+"""Names of the suites; the benchmark is imported later."""
+VIEWER_PORT = 8770
+"""Default port of the viewer; if taken, the next free one."""
+Topic = Annotated[str | None, options.shown("TOPIC")]
+Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+ImagePath = Annotated[Path | None, options.shown("FILE")]
+
+
+class RunCommand(options.ComputingCommand):
+    """A command that writes a run folder."""
+
+    source: str
+    settings: options.Modelling = options.Modelling()
+    out: options.OutPath = Path("run")
+    """Run folder to write; replaces an existing run."""
+    no_report: options.Flag = False
+    """Do not write report.html."""
+    profile: options.Flag = False
+    """Print the time of each stage; with --json, add it to the document."""
+
+
+class Explore(RunCommand, options.ExploringCommand, work="run:explore_scene"):
+    """Explore a scene view by view and infer which object supports which.
+
+    SOURCE is one of:
+      a built-in scene: tower, clutter, pile-8-0, dense-12-0, …
+      an MJCF scene, simulated with robot and camera: an .xml file, or a folder with a scene.xml
+      a recording: a folder in the BOP format; next views are chosen from its views
+
+    Usage examples:
+      caryatid explore tower --out run
+      caryatid explore clutter --goal o3 --out run
+      caryatid explore scene.xml --views 5 --out run
+      caryatid explore tower --robot arm:arm.npz --out run
+      caryatid explore recording/ --segmentation auto --out run
+    """
+
+    source: options.SourceName
+    """Scene or recording."""
+    no_early_stop: options.Flag = False
+    """Continue to the maximum number of views, even if no view is worth its path."""
+    goal: Annotated[str | None, options.shown("ID")] = None
+    """Object to remove: explore only what matters for it, and stop when it is clear what else would move."""
+    until: Annotated[float | None, options.shown("P", "0.95 with --goal, else never")] = None
+    """Stop when every support (with --goal, every effect of the removal) is known with this probability."""
+    view: options.Flag = False
+    """Show the exploration in the browser; Ctrl-C closes the page."""
+
+
+class Demo(RunCommand, work="run:run_demo"):
+    """Explore a built-in cluttered table in simulation, and print what each view adds.
+
+    Usage examples:
+      caryatid demo
+      caryatid demo --scene bridge --view
+    """
+
+    source: Annotated[str, tyro.conf.arg(name="scene", metavar="NAME")] = "clutter"
+    """Built-in scene, such as tower, bridge or dense-12-0."""
+    views: Annotated[options.Count | None, options.default_of("active.max_views")] = None
+    """Maximum number of views, including the first."""
+    view: options.Flag = False
+    """Show the exploration in the browser; Ctrl-C closes the page."""
+
+
+class View(options.ExploringCommand, work="run:show_run"):
+    """Show a finished run in the browser, or explore a scene or recording interactively.
+
+    SOURCE is one of:
+      a run folder written by explore, extract or clear, or a session; it is not modified
+      a built-in scene, an MJCF scene or a recording, as for explore
+
+    By default, only this machine can open the page. The page works offline; Ctrl-C closes it.
+
+    Usage examples:
+      caryatid view run
+      caryatid view clutter
+      caryatid view recording/ --segmentation auto --port 8080 --no-browser
+    """
+
+    source: options.SourceName
+    """Run, session, scene or recording."""
+    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address to listen on; with any but 127.0.0.1, other machines can open the page by its full address."""
+    port: options.Natural = VIEWER_PORT
+    """Port to listen on; if taken, the next free one; 0 = any free port."""
+    no_browser: options.Flag = False
+    """Print the address of the page, but do not open a browser."""
+
+
+class Extract(RunCommand, options.LookingCommand, work="run:extract_views"):
+    """Extract shapes and a support graph from all views of a recording, or from one cloud.
+
+    Usage examples:
+      caryatid extract recording/ --out run
+      caryatid extract table.pcd --segmentation auto --out run
+    """
+
+    source: options.SourceName
+    """Recording (folder in the BOP format) or cloud (.pcd, .ply)."""
+    label_divisor: options.Count = 1
+    """For clouds with labels of object parts: object = label // N."""
+    level: options.Flag = False
+    """Rotate the world frame of a recording so that the table is level; use it if z does not point up."""
+
+
+class Clear(options.LiftingCommand, options.ExploringCommand, work="run:clear_table"):
+    """Clear a simulated table: look until the next lift is safe, remove the object, look again.
+
+    Objects are lifted straight up, one by one. A lift disturbs another object if it moves that object by
+    more than 2 cm or 15°. If interrupted, run the same command to continue.
+
+    Usage examples:
+      caryatid clear bridge
+      caryatid clear clutter --goal o3 --hands 2
+      caryatid clear scene.xml --risk 0.1 --out run
+    """
+
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    """Built-in or MJCF scene."""
+    out: options.OutPath = Path("run")
+    """Run folder to write, view by view; replaces an existing run, or continues it if interrupted."""
+    views: Annotated[options.Count | None, options.default_of("active.max_views")] = None
+    """Maximum number of views before each lift."""
+    no_report: options.Flag = False
+    """Do not write report.html."""
+
+
+class Import(options.Command, work="results:import_log"):
+    """Convert a robot's log to a recording: sharp views from different viewpoints, with their poses.
+
+    Read bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), or a folder of the
+    TUM RGB-D benchmark, which needs no topics. Depth must be registered to the colour image.
+
+    Usage examples:
+      caryatid import pour.bag --out pour
+      caryatid import pour.bag --depth /depth/image --info /depth/camera_info --tf map --out pour
+      caryatid import rgbd_dataset_freiburg1_desk --out desk
+    """
+
+    settings: options.Settings = options.Settings()
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """Bag, or TUM RGB-D folder with depth.txt."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
+    """Recording to write, a folder in the BOP format; must be new or empty."""
+    depth: Topic = None
+    """Depth images: 16UC1 or mono16 [mm], 32FC1 [m], or PNG-compressed. If omitted, list all topics."""
+    info: Topic = None
+    """CameraInfo of the depth images."""
+    rgb: Topic = None
+    """Colour images that depth is registered to; also used to pick sharp frames."""
+    tf: Annotated[str | None, options.shown("FRAME")] = None
+    """World frame with z up, such as map or base_link. If omitted, import one frame without a pose."""
+    camera: Annotated[Path | None, options.shown("FILE.json")] = None
+    """Intrinsics of a TUM RGB-D folder: fx, fy, cx, cy [px]. If omitted, the published values."""
+    level: options.Flag = False
+    """Rotate the world frame so that z points up from the table, which most views must show."""
+    views: Annotated[options.Count | None, options.default_of("recording.max_views")] = None
+    """Maximum number of views."""
+
+
+class Evaluate(options.Command, work="results:print_scores"):
+    """Score each view of a run: precision, recall and F1 of vertices and edges, mean IoU, probabilities.
+
+    Brier score (0 is perfect) and average precision (1 is perfect) rate the probabilities of supports
+    between objects that were found.
+
+    Usage examples:
+      caryatid evaluate run
+      caryatid evaluate run scenes/tower
+    """
+
+    run: options.RunPath
+    """Run folder or session."""
+    truth: Annotated[str | None, tyro.conf.Positional, options.shown("[GT]", "the run's source")] = None
+    """Scene (built-in name, scene.xml or its folder), or a recording with masks and gt.json."""
+
+
+class Order(options.LiftingCommand, options.ComputingCommand, work="results:find_order"):
+    """Find a safe order in which to remove all objects, or to reach one.
+
+    Rehearse each lift in physics, on the extracted shapes and on samples of their uncertainty, to estimate
+    the probability that nothing else moves. If no order is safe, print the least risky one and the objects
+    that block each other.
+
+    Usage examples:
+      caryatid order run
+      caryatid order run --goal o3
+      caryatid order run --risk 0.2
+    """
+
+    settings: options.Modelling = options.Modelling()
+    run: options.RunPath
+    """Run folder, session, or graph.json."""
+
+
+class Report(options.Command, work="results:redraw_report"):
+    """Write the report of a run again, optionally also as a PDF.
+
+    Usage examples:
+      caryatid report run
+      caryatid report run --pdf report.pdf
+    """
+
+    run: options.RunPath
+    """Run folder or session; its report.html is replaced."""
+    pdf: Annotated[Path | None, options.shown("FILE.pdf")] = None
+    """Also write a PDF (A4); replaces an existing file."""
+
+
+class Export(options.Command, work="results:export_model"):
+    """Export the scene model of a run to simulators, 3D viewers and graph tools.
+
+    Usage examples:
+      caryatid export run --format mjcf --out scene.xml
+      caryatid export run --out scene.glb
+    """
+
+    settings: options.Settings = options.Settings()
+    run: options.RunPath
+    """Run folder, session, or graph.json."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """File to write: .xml (mjcf), .urdf, .glb, .gltf, .graphml, .dot or .gv; replaces an existing file."""
+    format: Annotated[ExportFormat | None, options.shown(default="by the suffix of FILE")] = None
+    """mjcf: free bodies on a table; urdf: links fixed to the world; gltf: meshes; graphml, dot: the graph."""
+
+
+class Benchmark(options.Command, work="benchmark:compare_methods"):
+    """Compare methods over scenes and seeds, and draw figures.
+
+    Finished episodes are kept: stop at any time, and run the same command to continue. Without --suite,
+    redraw the figures of the results in the folder.
+
+    Usage examples:
+      caryatid benchmark --suite smoke --out bench
+      caryatid benchmark --suite planners --planner support --planner random --out bench
+      caryatid benchmark --suite fig5 --scenes my-scenes/ --seeds 1 --out bench
+      caryatid benchmark --suite planners --segmentation auto --noise none --out bench
+    """
+
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
+    """Folder of the results; existing results are reused."""
+    suite: Annotated[SuiteName | None, options.shown()] = None
+    """Suite of methods, scenes and conditions to run."""
+    scenes: Annotated[options.Words, options.shown("SCENE")] = ()
+    """Replace the suite's scenes: a built-in name, a scene folder, or a folder of those; may be repeated."""
+    planner: options.Several[Annotated[str, options.planner_name()]] = ()
+    """Replace the suite's planners; may be repeated. The first is the reference for the others."""
+    fusion: options.Several[FusionMethod] = ()
+    """Replace the suite's fusion; may be repeated."""
+    segmentation: options.Several[SegmentationMethod] = ()
+    """Replace the suite's segmentation; may be repeated. Default: labels."""
+    noise: options.Several[NoiseModel] = ()
+    """Replace the suite's camera noise; may be repeated. Default: carmine."""
+    preset: Annotated[Preset | None, options.shown(default="the suite's")] = None
+    """Settings to start from in all episodes: caryatid's defaults, or those of the paper."""
+    set: Annotated[options.Words, options.shown("STAGE.NAME=VALUE")] = ()
+    """Change one setting of all episodes, such as `--set noise.translation=0.02`; may be repeated."""
+    seeds: Annotated[options.Count | None, options.shown(default="the suite's")] = None
+    """Number of seeds; every episode runs with seeds 0 to N−1."""
+    views: Annotated[options.Count | None, options.shown(default="the suite's")] = None
+    """Number of views of every episode, including the first."""
+    jobs: Annotated[options.Count | None, options.shown(default="all cores")] = None
+    """Number of processes."""
+    scheduler: Annotated[str | None, options.shown("ADDRESS")] = None
+    """Run on the workers of this dask.distributed scheduler, such as tcp://10.0.0.5:8786."""
+    retry: options.Flag = False
+    """Run failed episodes again."""
+    reference: Annotated[str | None, options.shown("METHOD")] = None
+    """Reference method in the figures, instead of the suite's."""
+    docs: Annotated[Path | None, options.shown("FILE.md")] = None
+    """Also write the results as a Markdown document."""
+
+
+class SessionStep(options.ComputingCommand):
+    """A command on a session."""
+
+    folder: Folder
+    """Folder of the session."""
+
+
+class New(SessionStep, options.PlanningCommand, work="sessions:begin_session"):
+    """Create a session in a new folder.
+
+    Usage examples:
+      caryatid session new table
+      caryatid session new table --segmentation auto --set "robot.camera_height=[1.2, 1.8]"
+      caryatid session new table --robot arm:arm.npz
+    """
+
+    folder: Folder
+    """Folder of the session; must be new or empty."""
+
+
+class Add(SessionStep, work="sessions:add_view"):
+    """Add a view; exit status 0 means that the view is safe on disk.
+
+    camera.json: {"K": 3×3 [px], "T_world_camera": 4×4 [m], "depth_scale": mm per unit of depth (default 1)}
+    The first view may omit T_world_camera: its table then defines the world frame (z = 0), --json prints the
+    camera pose, and `next` requires --candidates.
+
+    Usage examples:
+      caryatid session add table --depth depth.png --camera camera.json
+      caryatid session add table --depth depth.npy --rgb rgb.png --labels labels.png --camera camera.json
+    """
+
+    depth: Annotated[Path, tyro.conf.arg(metavar="D.png")]
+    """Depth image: 16-bit PNG, or .npy in metres; 0 or NaN = no reading."""
+    camera: Annotated[Path, tyro.conf.arg(metavar="C.json")]
+    """Camera matrix, camera pose, and scale of the depth image."""
+    rgb: ImagePath = None
+    """Colour image: PNG, JPEG or .npy."""
+    labels: ImagePath = None
+    """Object number of each pixel: grey PNG or .npy; 0 = no object. An object has one number in all views."""
+    number: Annotated[int | None, options.shown("N")] = None
+    """Number of the view, from 0; makes a repeated command safe: an existing view is not added again."""
+
+
+class Next(SessionStep, work="sessions:plan_view"):
+    """Print the next best view as JSON: camera pose, platform pose, gaze, expected gain and reason.
+
+    candidates.json: {"T_world_camera": [4×4 …] reachable poses, "path_length": [m …], "refused": [4×4 …]
+    poses to which the robot cannot go after all}; all are optional
+
+    Usage examples:
+      caryatid session next table
+      caryatid session next table --candidates candidates.json
+    """
+
+    candidates: Annotated[Path | None, options.shown("C.json")] = None
+    """Candidate poses to choose from, instead of those that the session's robot reaches; or poses to omit."""
+
+
+class Graph(SessionStep, work="sessions:show_graph"):
+    """Print the current support graph in the format of graph.json.
+
+    Usage examples:
+      caryatid session graph table > graph.json
+    """
+
+
+class Take(SessionStep, work="sessions:report_change"):
+    """Report that the robot removed or moved an object; exit status 0 means that this is safe on disk.
+
+    moved.json: {"T": 4×4 [m], the object's motion as a rigid transform in the world frame}
+
+    Usage examples:
+      caryatid session take table o3
+      caryatid session take table o3 --moved moved.json
+    """
+
+    object: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ID")]
+    """ID of the object."""
+    moved: Annotated[Path | None, options.shown("T.json")] = None
+    """The object's motion. If omitted, the object was removed."""
+    number: Annotated[int | None, options.shown("N")] = None
+    """Number of the report, from 0; makes a repeated command safe: the newest report is not repeated."""
+
+
+class Undo(SessionStep, work="sessions:undo_last"):
+    """Undo the last view, or the last report of a removed or moved object.
+
+    Usage examples:
+      caryatid session undo table
+    """
+
+
+@dataclass(frozen=True)
+class Session:
+    """Keep a scene model in a folder, and add views from the robot's own software.
+
+    Saved data survives a crash. Only one command writes at a time.
+    """
+
+    step: New | Add | Next | Graph | Take | Undo
+
+    @property
+    def general(self) -> options.General:
+        """Output options of the step."""
+        return self.step.general
+
+    def __call__(self) -> int | None:
+        """Run the step."""
+        return self.step()
+
+
+class Serve(SessionStep, work="sessions:serve_sessions"):
+    """Serve sessions over HTTP, for robot software in any language; /openapi.json describes the API.
+
+    On 127.0.0.1, only programs on this machine can connect, without a token. Any other --host requires
+    requests with `Authorization: Bearer TOKEN`. Traffic is not encrypted: use a network you trust.
+
+    Usage examples:
+      caryatid serve sessions
+      CARYATID_TOKEN=$(openssl rand -hex 16) caryatid serve sessions --host 0.0.0.0
+    """
+
+    settings: options.Settings = options.Settings()
+    folder: Folder
+    """Folder of the sessions; created if missing."""
+    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address to listen on."""
+    port: options.Natural = 8765
+    """Port to listen on; 0 = any free port."""
+    token: Annotated[str | None, options.shown("TOKEN")] = None
+    """Token that requests must send; prefer CARYATID_TOKEN, which process lists do not show."""
+    open_sessions: options.Count = 4
+    """Number of sessions kept in memory; others are loaded on request in a tenth of a second."""
+    waiting: options.Count = 16
+    """Maximum number of requests that arrive or wait; further requests get status 503."""
+    max_request: options.Count = 16
+    """Maximum size of a request [MB]."""
+
+
+class Scenes(options.Command, work="commands:print_scenes"):
+    """List the built-in scenes and the sample recordings.
+
+    Usage examples:
+      caryatid scenes
+    """
+
+
+class Config(options.Command, work="commands:print_config"):
+    """Print all settings as TOML, to edit and pass to --config.
+
+    Usage examples:
+      caryatid config > settings.toml
+    """
+
+    settings: options.Modelling = options.Modelling()
+
+
+class Completion(options.Command, work="commands:print_completion"):
+    """Print a shell completion script for commands, options, scenes, settings and files.
+
+    Usage examples:
+      source <(caryatid completion bash)
+      caryatid completion bash > ~/.local/share/bash-completion/completions/caryatid
+      caryatid completion zsh > "${fpath[1]}/_caryatid"
+      caryatid completion fish > ~/.config/fish/completions/caryatid.fish
+      caryatid completion tcsh > ~/.caryatid.tcsh && echo source ~/.caryatid.tcsh >> ~/.tcshrc
+    """
+
+    shell: Annotated[Literal["bash", "zsh", "fish", "tcsh"], tyro.conf.Positional]
+    """Shell to print the script for."""
+
+
+COMMANDS: dict[str, type[options.Command | Session]] = {
+    command.__name__.lower(): command
+    for command in (
+        Demo, Explore, Extract, View, Evaluate, Order, Clear, Import, Report, Export, Benchmark, Session,
+        Serve, Scenes, Config, Completion,
+    )
+}  # fmt: skip
+"""The commands in the order of the help."""
 
 DESCRIPTION = """Explore a cluttered table and find out which object supports which.
 
@@ -32,40 +493,13 @@ Get started:
 """
 """Text at the top of the help."""
 
-COMMANDS = {
-    "demo": "run:Demo",
-    "explore": "run:Explore",
-    "extract": "run:Extract",
-    "view": "run:View",
-    "evaluate": "results:Evaluate",
-    "order": "results:OrderCommand",
-    "clear": "run:Clear",
-    "import": "results:Import",
-    "report": "results:ReportCommand",
-    "export": "results:Export",
-    "benchmark": "benchmark:Benchmark",
-    "session": "sessions:SessionCommand",
-    "serve": "sessions:Serve",
-    "scenes": "commands:Scenes",
-    "config": "commands:ShowConfig",
-    "completion": "commands:Completion",
-}
-"""Module and class of each command, in the order of the help; imported on demand."""
-
 MARKERS = (
-    tyro.conf.DisallowNone,
     tyro.conf.FlagCreatePairsOff,
     tyro.conf.HelptextFromCommentsOff,
     tyro.conf.OmitArgPrefixes,
     tyro.conf.OmitSubcommandPrefixes,
 )
 """How tyro turns fields into options."""
-
-
-def find_command(name: str) -> type:
-    """Return the dataclass of a command."""
-    command: type = resolve_name(f"caryatid.cli.{COMMANDS[name]}")
-    return command
 
 
 def read_command(arguments: Sequence[str]) -> Any:
@@ -78,55 +512,52 @@ def read_command(arguments: Sequence[str]) -> Any:
     tyro._experimental_options["ansi_codes"] = shown
     if list(arguments[:1]) in ([], ["help"]):
         arguments = [*arguments[1:], "--help"]
-    name, *options = arguments
+    name, *words = arguments
     try:
         if name in COMMANDS:
-            return tyro.cli(find_command(name), prog=f"caryatid {name}", args=options, config=MARKERS)
-        read = tyro.cli(
-            _any_command(), prog="caryatid", description=DESCRIPTION, args=arguments, config=MARKERS
-        )
-        return read.command
+            return _parse(COMMANDS[name], f"caryatid {name}", words)
+        return _parse(_any_command(), "caryatid", arguments).command
     except SystemExit as end:
         if end.code:
-            _suggest(name, options)
+            _suggest(name, words)
         raise
 
 
-def _suggest(name: str, options: Sequence[str]) -> None:
+def _parse(kind: Any, program: str, arguments: Sequence[str]) -> Any:
+    description = None if kind in COMMANDS.values() else DESCRIPTION
+    return tyro.cli(
+        kind, prog=program, description=description, args=arguments, config=MARKERS, registry=options.REGISTRY
+    )
+
+
+def _suggest(name: str, words: Sequence[str]) -> None:
     """Print the command or the value of an option that a mistyped one resembles."""
-    pairs = [("", name)]
-    choices: dict[str, tuple[str, ...]] = {"": tuple(COMMANDS)}
-    if name in COMMANDS:
-        choices, pairs = _choices(find_command(name)), list(pairwise(options))
+    pairs = pairwise(words) if name in COMMANDS else [("", name)]
+    choices = _choices(COMMANDS[name]) if name in COMMANDS else {"": list(COMMANDS)}
     for option, word in pairs:
-        known = choices.get(option, ()) if not word.startswith("-") else ()
+        known = choices.get(option, []) if not word.startswith("-") else []
         if word not in known and (meant := get_close_matches(word, known, 1)):
             sys.stderr.write(f"Did you mean {meant[0]}?\n")
 
 
-def _choices(hint: Any) -> dict[str, tuple[str, ...]]:
-    """The words that each option of a command, or the type of one option (""), chooses from."""
-    found: dict[str, tuple[str, ...]] = {}
-    if isinstance(hint, PrimitiveConstructorSpec):
-        found[""] = hint.choices or ()
-    elif get_origin(hint) is Literal:
-        found[""] = tuple(map(str, get_args(hint)))
-    elif isinstance(hint, type) and is_dataclass(hint):
-        for name, part in get_type_hints(hint, include_extras=True).items():
-            found |= {
-                option or f"--{name.replace('_', '-')}": words for option, words in _choices(part).items()
-            }
+def _choices(kind: Any, option: str = "") -> dict[str, list[str]]:
+    """The words that each option of a command chooses from; `kind` is its type, or that of an option."""
+    if isinstance(kind, PrimitiveConstructorSpec):
+        return {option: list(kind.choices or ())}
+    if get_origin(kind) is Literal:
+        return {option: [str(word) for word in get_args(kind)]}
+    if isinstance(kind, type) and is_dataclass(kind):
+        hints = get_type_hints(kind, include_extras=True)
+        parts = [(part, f"--{name.replace('_', '-')}") for name, part in hints.items()]
     else:
-        for part in (*get_args(hint), *getattr(hint, "__metadata__", ())):
-            found |= _choices(part)
-    return found
+        parts = [(part, option) for part in (*get_args(kind), *getattr(kind, "__metadata__", ()))]
+    return {name: words for part in parts for name, words in _choices(*part).items()}
 
 
 def _any_command() -> Any:
     """The type of all commands, each with the first line of its help."""
     subcommands = []
-    for name in COMMANDS:
-        command = find_command(name)
+    for name, command in COMMANDS.items():
         summary = (inspect.getdoc(command) or "").partition("\n")[0]
         spec = tyro.conf.subcommand(name, constructor=command, description=summary)
         subcommands.append(Annotated[Any, spec])
@@ -136,42 +567,21 @@ def _any_command() -> Any:
     return make_dataclass("Caryatid", [("command", chosen), ("version", version, False)])
 
 
-@dataclass(frozen=True, kw_only=True)
-class Scenes(Command):
-    """List the built-in scenes and the sample recordings.
+def print_scenes(command: Scenes) -> None:
+    from caryatid.cli.output import table
+    from caryatid.io.datasets import DESCRIPTIONS
+    from caryatid.simulation.scenes import list_scenes
 
-    Usage examples:
-      caryatid scenes
-    """
-
-    def __call__(self) -> None:
-        from caryatid.cli.output import table
-        from caryatid.io.datasets import DESCRIPTIONS
-        from caryatid.simulation.scenes import list_scenes
-
-        scenes = list_scenes()
-        shown = [
-            table(title, ("name", "description"), what.items())
-            for title, what in (("Built-in scenes", scenes), ("Samples", DESCRIPTIONS))
-        ]
-        self.output.result({"scenes": scenes, "samples": DESCRIPTIONS}, *shown)
+    scenes, columns = list_scenes(), ("name", "description")
+    shown = table("Built-in scenes", columns, scenes.items()), table("Samples", columns, DESCRIPTIONS.items())
+    command.output.result({"scenes": scenes, "samples": DESCRIPTIONS}, *shown)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShowConfig(Command):
-    """Print all settings as TOML, to edit and pass to --config.
+def print_config(command: Config) -> None:
+    from caryatid.config.settings import write_settings
 
-    Usage examples:
-      caryatid config > settings.toml
-    """
-
-    settings: Modelling = Modelling()
-
-    def __call__(self) -> None:
-        from caryatid.config.settings import write_settings
-
-        config = self.settings.read()
-        self.output.result(asdict(config), write_settings(config))
+    config = command.settings.read()
+    command.output.result(asdict(config), write_settings(config))
 
 
 OFFERS = """
@@ -201,37 +611,21 @@ FILES = {
 """Changes to tyro's script: files wherever nothing else is known, and no space after a setting's =."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Completion(Command):
-    """Print a shell completion script for commands, options, scenes, settings and files.
+def print_completion(command: Completion) -> None:
+    from caryatid.config import Config as AllSettings
+    from caryatid.io.datasets import DESCRIPTIONS
+    from caryatid.simulation.scenes import DESIGNED
 
-    Usage examples:
-      source <(caryatid completion bash)
-      caryatid completion bash > ~/.local/share/bash-completion/completions/caryatid
-      caryatid completion zsh > "${fpath[1]}/_caryatid"
-      caryatid completion fish > ~/.config/fish/completions/caryatid.fish
-      caryatid completion tcsh > ~/.caryatid.tcsh && echo source ~/.caryatid.tcsh >> ~/.tcshrc
-    """
-
-    shell: Annotated[Literal["bash", "zsh", "fish", "tcsh"], tyro.conf.Positional]
-    """Shell to print the script for."""
-
-    def __call__(self) -> None:
-        from caryatid.config import Config
-        from caryatid.io.datasets import DESCRIPTIONS
-        from caryatid.simulation.scenes import DESIGNED
-
-        script = io.StringIO()
-        words = ["--tyro-write-completion", self.shell, "-"]
-        with redirect_stdout(script), suppress(SystemExit):
-            tyro.cli(_any_command(), prog="caryatid", args=words, config=MARKERS)
-        settings = [f"{stage}.{name}=" for stage, values in asdict(Config()).items() for name in values]
-        recordings = [name for name in DESCRIPTIONS if "recording" in name]
-        both = [*DESIGNED, *recordings]
-        sources = {"explore": both, "view": both, "clear": [*DESIGNED], "extract": [*DESCRIPTIONS]}
-        text = script.getvalue()
-        offers = OFFERS.replace("SETTINGS", repr(settings)).replace("SOURCES", repr(sources))
-        text = re.sub("^COMPLETION_SPEC = .*", lambda line: line[0] + offers, text, flags=re.MULTILINE)
-        for old, new in FILES.items():
-            text = text.replace(old, new)
-        self.output.result({"shell": self.shell, "script": text}, text)
+    script = io.StringIO()
+    with redirect_stdout(script), suppress(SystemExit):
+        _parse(_any_command(), "caryatid", ["--tyro-write-completion", command.shell, "-"])
+    settings = [f"{stage}.{name}=" for stage, values in asdict(AllSettings()).items() for name in values]
+    both = [*DESIGNED, *(name for name in DESCRIPTIONS if "recording" in name)]
+    sources = {"explore": both, "view": both, "clear": [*DESIGNED], "extract": [*DESCRIPTIONS]}
+    offers = OFFERS.replace("SETTINGS", repr(settings)).replace("SOURCES", repr(sources))
+    known = re.sub(
+        "^COMPLETION_SPEC = .*", lambda line: line[0] + offers, script.getvalue(), flags=re.MULTILINE
+    )
+    for old, new in FILES.items():
+        known = known.replace(old, new)
+    command.output.result({"shell": command.shell, "script": known}, known)

@@ -4,14 +4,29 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
+from math import inf
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
+from pkgutil import resolve_name
+from types import NoneType, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    TypedDict,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+)
 
 import tyro
-from tyro.constructors import PrimitiveConstructorSpec
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from caryatid.config.choices import (
     FusionMethod,
@@ -42,58 +57,52 @@ def default_of(setting: str, metavar: str | None = None) -> object:
     return shown(metavar, attrgetter(setting)(Config()))
 
 
-def one_of(choice: Any) -> PrimitiveConstructorSpec[Any]:
-    """One of a few words (or of a Literal), or None if omitted; anything else is a usage error."""
-    words: tuple[str, ...] = get_args(choice) or choice
-    return _word("{" + ",".join(words) + "}", str, words)
-
-
-def planner_name() -> PrimitiveConstructorSpec[Any]:
+def planner_name() -> Any:
     """The name of a planner, including those of other packages."""
     from caryatid.planning.planners import BUILT_IN, ORACLE, offered
 
-    return one_of((*BUILT_IN, *sorted(offered()), ORACLE))
+    names: Any = Literal[(*BUILT_IN, *sorted(offered()), ORACLE)]
+    return ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(names, set()))
 
 
-def whole_number(least: int) -> PrimitiveConstructorSpec[Any]:
-    """An integer of at least `least`, or None if omitted; anything else is a usage error."""
-
-    def parse(word: str) -> int:
-        if not word.isdecimal() or int(word) < least:
-            raise ValueError(f"{word} is not an integer of at least {least}")
-        return int(word)
-
-    return _word("N", parse)
-
-
-def probability() -> PrimitiveConstructorSpec[Any]:
-    """A number from 0 to 1, or None if omitted; anything else is a usage error."""
-
-    def parse(word: str) -> float:
-        if not 0.0 <= float(word) <= 1.0:
-            raise ValueError(f"{word} is not a probability from 0 to 1")
-        return float(word)
-
-    return _word("P", parse)
-
-
-def _word(
-    metavar: str, parse: Callable[[str], Any], choices: tuple[str, ...] | None = None
+def number(
+    kind: Callable[[str], float], metavar: str, what: str, least: float, most: float = inf
 ) -> PrimitiveConstructorSpec[Any]:
+    """A number within bounds; anything else is a usage error."""
+
+    def parse(words: list[str]) -> float:
+        with suppress(ValueError):
+            if least <= (value := kind(words[0])) <= most:
+                return value
+        raise ValueError(f"{words[0]} is not {what}")
+
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar=metavar,
-        instance_from_str=lambda words: parse(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, str | int | float),
+        instance_from_str=parse,
+        is_instance=lambda value: isinstance(value, int | float),
         str_from_instance=lambda value: [str(value)],
-        choices=choices,
     )
 
 
+REGISTRY = ConstructorRegistry()
+"""How options are parsed, in addition to tyro's own rules."""
+
+
+@REGISTRY.primitive_rule
+def _parse_optional(info: PrimitiveTypeInfo) -> Any:
+    """Parse `kind | None` like `kind`: the option may be omitted, and None is not one of its words."""
+    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
+    if info.type_origin not in (Union, UnionType) or len(kinds) != 1:
+        return None
+    spec: Any = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kinds[0], info.markers))
+    return replace(spec, is_instance=lambda value: value is None or spec.is_instance(value))
+
+
 Flag = Annotated[bool, shown()]
-Count = Annotated[int, whole_number(1)]
-OptionalCount = Annotated[int | None, whole_number(1)]
-Port = Annotated[int, whole_number(0)]
+Count = Annotated[int, number(int, "N", "an integer of at least 1", 1)]
+Natural = Annotated[int, number(int, "N", "an integer of at least 0", 0)]
+Probability = Annotated[float, number(float, "P", "a probability from 0 to 1", 0.0, 1.0)]
 OutPath = Annotated[Path, tyro.conf.arg(metavar="RUN")]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 SourceName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
@@ -124,15 +133,7 @@ class Settings:
     """Change one setting, such as `--set fit.hypotheses=200`; overrides the file; may be repeated."""
 
     def read(self, options: Mapping[str, object] | None = None, base: Config | None = None) -> Config:
-        """The configuration: option > --set > file > default.
-
-        Args:
-            options: Name of a setting → value of its option, or None if omitted.
-            base: The defaults; None = those of `Config`.
-
-        Raises:
-            InputError: A file, name or value is not valid.
-        """
+        """The configuration: options (name of a setting → value, or None) > --set > file > base."""
         from caryatid.config.settings import read_settings
 
         given = [f"{name}={value}" for name, value in (options or {}).items() if value is not None]
@@ -143,16 +144,16 @@ class Settings:
 class Modelling(Settings):
     """Settings of the method."""
 
-    preset: Annotated[Preset, one_of(Preset)] = "default"
+    preset: Preset = "default"
     """Settings to start from: caryatid's defaults, or those of the paper."""
-    fusion: Annotated[FusionMethod | None, one_of(FusionMethod), default_of("fusion.method")] = None
+    fusion: Annotated[FusionMethod | None, default_of("fusion.method")] = None
     """What to fuse over views: points (pc), graphs (sg), or both."""
     masks: Annotated[
         str | None, tyro.conf.arg(metavar="{scene,per-view,onnx:FILE,FOLDER}"), default_of("fusion.masks")
     ] = None
     """What mask numbers identify: objects (scene) or segments of a view (per-view).
     Or where masks come from: a model or a folder."""
-    seed: Annotated[int, whole_number(0)] = 0
+    seed: Natural = 0
     """Random seed; the same seed gives the same graph, byte for byte."""
 
     def read(
@@ -165,8 +166,7 @@ class Modelling(Settings):
         """The configuration, as `Settings.read` returns it, with the options here.
 
         Raises:
-            InputError: As for `Settings.read`; or masks come from a model or folder, and the command does not
-                take views.
+            InputError: Masks come from a model or folder, and the command does not take views.
         """
         from caryatid.config.settings import preset
 
@@ -183,11 +183,21 @@ class Modelling(Settings):
         return None if self.masks in (None, *get_args(MaskIdentity)) else self.masks
 
 
+@dataclass_transform(frozen_default=True, kw_only_default=True)
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """A command."""
+    """A command: a dataclass of its options. `work` names the function that runs it, as `module:function`."""
 
     general: General = General()
+    _work: ClassVar[str]
+
+    def __init_subclass__(cls, work: str = "") -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
+        cls._work = work
+
+    def __call__(self) -> int | None:
+        status: int | None = resolve_name(f"caryatid.cli.{self._work}")(self)
+        return status
 
     @cached_property
     def output(self) -> Output:
@@ -197,11 +207,10 @@ class Command:
         return Output(json=self.general.json, quiet=self.general.quiet)
 
 
-@dataclass(frozen=True, kw_only=True)
 class ComputingCommand(Command):
     """A command that computes."""
 
-    threads: Annotated[OptionalCount, shown(default="CARYATID_THREADS, or all cores")] = None
+    threads: Annotated[Count | None, shown(default="CARYATID_THREADS, or all cores")] = None
     """Number of threads."""
 
     def __post_init__(self) -> None:
@@ -209,17 +218,26 @@ class ComputingCommand(Command):
             os.environ["CARYATID_THREADS"] = str(self.threads)
 
 
-@dataclass(frozen=True, kw_only=True)
+class Looking(TypedDict):
+    """Options that every processing of views takes."""
+
+    segmentation: SegmentationMethod | None
+    seed: int
+
+
 class LookingCommand(ComputingCommand):
     """A command that processes views."""
 
     settings: Modelling = Modelling()
-    segmentation: Annotated[
-        SegmentationMethod | None, one_of(SegmentationMethod), shown(default="labels if available")
-    ] = None
+    segmentation: Annotated[SegmentationMethod | None, shown(default="labels if available")] = None
     """Use the given masks or labels, or segment automatically."""
     ignore: Annotated[Path | None, shown("MASK.png")] = None
     """Pixels to ignore, such as the robot's arm: a grey PNG, 0 = keep; or a folder, one NAME.png per view."""
+
+    @property
+    def looking(self) -> Looking:
+        """The options that every processing of views takes."""
+        return {"segmentation": self.segmentation, "seed": self.settings.seed}
 
     def mask_source(self, config: Config) -> MaskSource | None:
         """The source of masks, or None.
@@ -238,11 +256,12 @@ class LookingCommand(ComputingCommand):
         return mask_source(settings.masks_from, config, settings.seed)
 
 
-@dataclass(frozen=True, kw_only=True)
 class PlanningCommand(LookingCommand):
     """A command that plans the next best view."""
 
-    planner: Annotated[str | None, planner_name(), shown(default="support; paper with --preset paper")] = None
+    planner: Annotated[
+        Annotated[str, planner_name()] | None, shown(default="support; paper with --preset paper")
+    ] = None
     """Planner of the next best view; oracle uses the ground truth and requires a simulation."""
     robot: Annotated[str, tyro.conf.arg(metavar="NAME")] = "humanoid"
     """Robot that carries the camera: humanoid, arm:FILE.npz (a reachability map), or module:callable."""
@@ -253,20 +272,20 @@ class PlanningCommand(LookingCommand):
         return self.planner or ("paper" if self.settings.preset == "paper" else "support")
 
 
-@dataclass(frozen=True, kw_only=True)
 class ExploringCommand(PlanningCommand):
     """A command that explores a scene."""
 
-    views: Annotated[OptionalCount, default_of("active.max_views")] = None
+    views: Annotated[Count | None, default_of("active.max_views")] = None
     """Maximum number of views, including the first."""
+    source: SourceName
     level: Flag = False
     """Rotate the world frame of a recording so that the table is level; use it if z does not point up."""
     noise: NoiseModel = "carmine"
     """Noise of the simulated camera: depth noise and registration error of a Carmine, or none."""
 
-    def config(self) -> Config:
-        """All settings."""
-        return self.settings.read({"active.max_views": self.views}, takes_views=True)
+    def config(self, options: Mapping[str, object] | None = None) -> Config:
+        """All settings; `options` as for `Settings.read`."""
+        return self.settings.read({"active.max_views": self.views, **(options or {})}, takes_views=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,11 +296,11 @@ class LiftingCommand:
     """Object to reach; remove no more than necessary."""
     hands: Literal[1, 2] = 1
     """Number of hands; with 2, one may hold an object while the other lifts one."""
-    gripper: Annotated[GripperKind | None, one_of(GripperKind), default_of("gripper.kind")] = None
+    gripper: Annotated[GripperKind | None, default_of("gripper.kind")] = None
     """Offer only lifts with a grasp on a free path; dimensions are the settings `gripper.*`."""
     reach: Annotated[Path | None, shown("FILE.npz")] = None
     """Offer only grasps within an arm's reach: a reachability map of the gripper, in the world frame."""
-    risk: Annotated[float | None, probability(), default_of("rehearsal.risk")] = None
+    risk: Annotated[Probability | None, default_of("rehearsal.risk")] = None
     """Maximum probability that a lift moves another object."""
 
     def lift_settings(self) -> dict[str, object]:

@@ -20,16 +20,9 @@ if TYPE_CHECKING:
 
 
 class Output(logging.Handler):
-    """Print progress, results, and log messages of the package.
+    """Print progress, results, and log messages of the package; `warnings` are those so far.
 
     Spinners and bars appear only if stderr is a terminal, even with FORCE_COLOR.
-
-    Args:
-        json: Print only the result, as one JSON document.
-        quiet: Do not print progress.
-
-    Attributes:
-        warnings: Warnings of the package so far.
     """
 
     def __init__(self, *, json: bool, quiet: bool) -> None:
