@@ -123,14 +123,11 @@ class TestCandidates:
             assert_gaze(posture, T)
         assert [p.joints for p in (arm(T_world_camera=views[0])).waypoints(views[9])] == [None, None]
         assert arm(confirm=lambda T: None).confirm(views[0]) is not None
-
-    def test_joints_are_kept_although_confirm_writes_the_next_into_the_same_array(self):
         solution = np.array([0.1, 0.2])
-        robot = arm(confirm=lambda T: solution)
-        views = offered(robot).T_world_camera
-        robot.confirm(views[0])
-        solution[:] = 0.5
-        np.testing.assert_array_equal(robot.waypoints(views[0])[0].joints, [0.1, 0.2])
+        kept = arm(confirm=lambda T: solution)
+        kept.confirm(views[0])
+        solution[:] = 0.5  # the next answer is written into the same array
+        np.testing.assert_array_equal(kept.waypoints(views[0])[0].joints, [0.1, 0.2])
 
     @pytest.mark.parametrize("seed", range(2))
     def test_base_and_table_moved_together_change_nothing(self, seed):
@@ -148,53 +145,42 @@ class TestCandidates:
             np.testing.assert_allclose(elsewhere.T_world_camera, T @ here.T_world_camera, atol=1e-9)
 
 
-class TestSolve:
-    @pytest.mark.parametrize(
-        ("reachable", "eye", "distance"),
-        [(within_arms_length, (2.0, 0.0, 1.5), 2.61), (sideways_only, (-0.3, 0.0, 1.2), 0.49)],
-    )
-    def test_it_says_why_not(self, reachable, eye, distance):
-        says = f"cannot reach this view: out of the hand's reach, {distance} m from the base"
-        with pytest.raises(PlanningError, match=says):
-            arm(reachable).move_to(transforms.look_at(eye, TOP))
+@pytest.mark.parametrize(
+    ("reachable", "eye", "distance"),
+    [(within_arms_length, (2.0, 0.0, 1.5), 2.61), (sideways_only, (-0.3, 0.0, 1.2), 0.49)],
+)
+def test_it_says_why_it_cannot_reach_a_view(reachable, eye, distance):
+    says = f"cannot reach this view: out of the hand's reach, {distance} m from the base"
+    with pytest.raises(PlanningError, match=says):
+        arm(reachable).move_to(transforms.look_at(eye, TOP))
 
-    def test_a_base_must_be_a_pose(self):
-        with pytest.raises(InputError, match="T_world_base"):
-            arm(T_world_base=2.0 * BASE)
 
-    @pytest.mark.parametrize(
-        "answer", [lambda T: True, lambda T: np.ones((len(T), 1), dtype=bool), lambda T: np.ones(len(T))]
-    )
-    def test_an_answer_that_is_not_one_bool_a_pose_is_refused(self, answer):
-        robot = arm(answer)
+def test_bases_and_answers_that_make_no_sense_are_refused():
+    with pytest.raises(InputError, match="T_world_base"):
+        arm(T_world_base=2.0 * BASE)
+    for answer in (lambda T: True, lambda T: np.ones((len(T), 1), dtype=bool), lambda T: np.ones(len(T))):
         with pytest.raises(InputError, match=r"reachable: returned .* return bool of shape"):
-            robot.view_sphere(PROPOSED)
+            arm(answer).view_sphere(PROPOSED)
 
 
 SETTINGS = replace(FEW_VIEWS, arm=CONFIG)
 
 
-def first_step(reachable, confirm=None):
-    """The first, and only, step of an exploration with an arm that goes nowhere."""
-    camera = SimulatedCamera(load_scene("tower"), sensor=SENSOR)
-    robot = arm(reachable, confirm=confirm, T_world_camera=look_from(180.0))
-    (step,) = explore(camera, robot, config=SETTINGS)
-    return step
-
-
 @pytest.mark.slow
-def test_where_nothing_is_in_reach_it_stops_with_reasons_and_counts():
-    step = first_step(lambda T_base_camera: np.zeros(len(T_base_camera), dtype=bool))
-    low, out = (step.candidates.rejected[reason] for reason in (REASONS[0], REASONS[2]))
-    assert low + out == CONFIG.sphere_points
-    assert step.stop == f"no candidate views left: {REASONS[0]} ({low}), {REASONS[2]} ({out})"
-
-
-@pytest.mark.slow
-def test_an_arm_that_confirms_nothing_stops():
+def test_where_nothing_is_in_reach_or_confirmed_it_stops_with_reasons_and_counts():
     asked = []
-    step = first_step(within_arms_length, asked.append)
-    assert step.stop == f"the robot refused 20 views in a row: {UNCONFIRMED}"
+    stops = {}
+    for name, reachable, confirm in (
+        ("reach", lambda T_base_camera: np.zeros(len(T_base_camera), dtype=bool), None),
+        ("confirm", within_arms_length, asked.append),
+    ):
+        camera = SimulatedCamera(load_scene("tower"), sensor=SENSOR)
+        robot = arm(reachable, confirm=confirm, T_world_camera=look_from(180.0))
+        (stops[name],) = explore(camera, robot, config=SETTINGS)
+    low, out = (stops["reach"].candidates.rejected[reason] for reason in (REASONS[0], REASONS[2]))
+    assert low + out == CONFIG.sphere_points
+    assert stops["reach"].stop == f"no candidate views left: {REASONS[0]} ({low}), {REASONS[2]} ({out})"
+    assert stops["confirm"].stop == f"the robot refused 20 views in a row: {UNCONFIRMED}"
     assert len(asked) == 20
 
 

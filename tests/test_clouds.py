@@ -8,7 +8,7 @@ from raycast import K, from_the_side, table_scene
 
 from caryatid.config import CloudConfig
 from caryatid.geometry import transforms
-from caryatid.sensing.clouds import estimate_normals, oriented_points, thin
+from caryatid.sensing.clouds import estimate_normals, oriented_points
 from caryatid.sensing.views import View
 
 CONFIG = CloudConfig()
@@ -47,14 +47,6 @@ def test_normals_do_not_smooth_over_depth_edges_and_need_readings():
     np.testing.assert_allclose(normals[beside], np.broadcast_to((0.0, 0.0, -1.0), (160, 3)), atol=1e-3)
 
 
-def test_a_view_with_normals_of_its_own_is_taken_as_exact():
-    given = np.tile(np.float32([0.0, 0.6, -0.8]), (48, 64, 1))
-    depth = np.random.default_rng(0).uniform(0.9, 1.1, (48, 64)).astype(np.float32)
-    points, normals, _ = oriented_points(View(depth=depth, K=K, normals_camera=given), CONFIG)
-    np.testing.assert_allclose(points[:, 2], depth.ravel(), rtol=1e-6)
-    np.testing.assert_array_equal(normals, given.reshape(-1, 3))
-
-
 def test_points_lie_on_the_pixels_rays_and_turn_with_the_camera():
     view = table_scene(from_the_side(), spheres=[SPHERE])
     points, normals, pixels = oriented_points(replace(view, T_world_camera=None), CONFIG)
@@ -64,19 +56,6 @@ def test_points_lie_on_the_pixels_rays_and_turn_with_the_camera():
     moved, turned, _ = oriented_points(view, CONFIG)
     np.testing.assert_allclose(moved, transforms.transform(view.pose, points), atol=1e-12)
     np.testing.assert_allclose(turned, transforms.rotate(view.pose, normals), atol=1e-12)
-
-
-def test_readings_left_out_are_no_points_and_bear_on_none():
-    view = table_scene(from_the_side(), spheres=[SPHERE], sigma=0.001)
-    ball = view.labels == 1
-    points, _, pixels = oriented_points(view, CONFIG, among=ball)
-    alone = replace(view, depth=np.where(ball, view.depth, 0.0))
-    expected, _, _ = oriented_points(alone, CONFIG)
-    assert ball.ravel()[pixels].all()
-    assert len(points) > 0.9 * ball.sum()
-    np.testing.assert_allclose(points, expected, atol=0.002)
-    given = replace(view, normals_camera=np.tile(np.float32([0.0, 0.0, -1.0]), (480, 640, 1)))
-    assert (oriented_points(given, CONFIG, among=ball)[2] == np.flatnonzero(ball)).all()
 
 
 def test_normals_of_a_cloud_follow_rigid_motion_and_face_the_viewpoint():
@@ -99,17 +78,3 @@ def test_normals_of_degenerate_clouds_face_the_viewpoint(count):
     assert normals.shape == (count, 3)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1.0)
     assert (normals[:, 2] > 0.9).all()
-
-
-def test_thin_keeps_the_points_nearest_to_the_means_of_their_voxels():
-    points = np.random.default_rng(2).uniform(-0.1, 0.1, size=(4000, 3))
-    points = np.concatenate([points, points[:500]])
-    _, owner = np.unique(np.floor(points / 0.02), axis=0, return_inverse=True)
-    owner = owner.ravel()
-    means = np.stack([np.bincount(owner, points[:, i]) / np.bincount(owner) for i in range(3)], axis=-1)
-    order = np.lexsort((np.sum((points - means[owner]) ** 2, axis=-1), owner))
-    nearest = order[np.unique(owner[order], return_index=True)[1]]
-    np.testing.assert_array_equal(thin(points, 0.02), np.sort(nearest))
-    assert len(nearest) == owner.max() + 1
-    assert len(thin(points[:0], 0.02)) == 0
-    assert len(thin(np.array([[0.0, 0.0, 0.0], [1e6, -1e6, 1e6]]), 1e-3)) == 2

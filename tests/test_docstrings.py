@@ -28,73 +28,58 @@ OURS = {
 }
 
 
-def public(kind: type) -> Iterator[tuple[str, ast.AST, str]]:
-    """Place, node and docstring of each public function or class."""
+def public() -> Iterator[tuple[str, ast.FunctionDef | ast.ClassDef, docstring_parser.Docstring, str]]:
+    """Place, node, parsed docstring and docstring of each public function and class."""
     for file in sorted(ROOT.rglob("*.py")):
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        stack = list(tree.body)
+        stack = list(ast.parse(file.read_text(encoding="utf-8")).body)
         while stack:
             node = stack.pop()
-            if getattr(node, "name", "_").startswith("_"):
+            if not isinstance(node, ast.FunctionDef | ast.ClassDef) or node.name.startswith("_"):
                 continue
-            if isinstance(node, ast.ClassDef):
-                stack += node.body
-            if isinstance(node, kind):
-                place = f"{file.relative_to(ROOT)}:{node.lineno} {node.name}"
-                yield place, node, ast.get_docstring(node) or ""
+            stack += node.body if isinstance(node, ast.ClassDef) else []
+            text = ast.get_docstring(node) or ""
+            parsed = docstring_parser.parse(text, style=docstring_parser.DocstringStyle.GOOGLE)
+            yield f"{file.relative_to(ROOT)}:{node.lineno} {node.name}", node, parsed, text
 
 
-def told(text: str) -> dict[str, str]:
-    """What a docstring's sections say of each name; `a, b` speak of several at once."""
-    found: dict[str, str] = {}
-    for entry in docstring_parser.parse(text, style=docstring_parser.DocstringStyle.GOOGLE).meta:
-        if len(entry.args) > 1:
-            names = [name.strip().lstrip("*") for name in entry.args[1].split(",")]
-            found |= dict.fromkeys(names, entry.description or "")
-    return found
+def annotated(node: ast.FunctionDef | ast.ClassDef) -> Iterator[tuple[str, ast.AST | None, str | None]]:
+    """Name, annotation and docstring of each argument and of the result, or of each field."""
+    if isinstance(node, ast.FunctionDef):
+        for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs):
+            yield a.arg, a.annotation, None
+        yield "its result", node.returns, None
+        return
+    for field, below in itertools.pairwise([*node.body, None]):
+        if isinstance(field, ast.AnnAssign) and not field.target.id.startswith("_"):
+            said = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+            yield field.target.id, field.annotation, str(below.value.value) if said else None
 
 
-def shaped(annotation: ast.AST | None, text: str) -> bool:
-    """Whether a text says the shape of what has this annotation, or need not."""
-    array = annotation is not None and ARRAYS.search(ast.unparse(annotation))
-    return not array or bool(SHAPE.search(text))
-
-
-def test_arrays_in_parameters_and_results_have_shapes():
+def test_arrays_in_parameters_results_and_fields_have_shapes():
     missing = []
-    for place, node, text in public(ast.FunctionDef):
+    for place, node, parsed, text in public():
         if ELSEWHERE.search(text) or node.name in PROTOCOLS:
             continue
-        known = told(text)
-        arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-        missing += [
-            f"{place}({a.arg})" for a in arguments if not shaped(a.annotation, known.get(a.arg, text))
-        ]
-        missing += [] if shaped(node.returns, text) else [f"{place} returns"]
-    assert not missing, "\n".join(missing)
-
-
-def test_arrays_in_fields_have_shapes():
-    missing = []
-    for place, node, text in public(ast.ClassDef):
-        known = told(text)
-        for field, below in itertools.pairwise([*node.body, None]):
-            if not isinstance(field, ast.AnnAssign) or field.target.id.startswith("_"):
-                continue
-            own = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
-            words = str(below.value.value) if own else known.get(field.target.id, text)
-            missing += [] if shaped(field.annotation, words) else [f"{place}.{field.target.id}"]
+        told: dict[str, str] = {}
+        for entry in parsed.meta:
+            if len(entry.args) > 1:  # `a, b` speak of several at once
+                names = [name.strip().lstrip("*") for name in entry.args[1].split(",")]
+                told |= dict.fromkeys(names, entry.description or "")
+        for name, annotation, said in annotated(node):
+            array = annotation is not None and ARRAYS.search(ast.unparse(annotation))
+            if array and not SHAPE.search(said or told.get(name, text)):
+                missing.append(f"{place}: {name}")
     assert not missing, "\n".join(missing)
 
 
 def test_errors_of_ours_are_documented():
     missing = []
-    for place, node, text in public(ast.FunctionDef):
-        if not text:  # linters accept this only of functions that run commands
-            continue
-        parsed = docstring_parser.parse(text, style=docstring_parser.DocstringStyle.GOOGLE)
+    for place, node, parsed, text in public():
         known = {entry.type_name for entry in parsed.raises}
-        raises = [n.exc for n in ast.walk(node) if isinstance(n, ast.Raise) and isinstance(n.exc, ast.Call)]
-        if "CaryatidError" not in known:
+        # Linters accept a missing docstring only of functions that run commands.
+        if isinstance(node, ast.FunctionDef) and text and "CaryatidError" not in known:
+            raises = [
+                r.exc for r in ast.walk(node) if isinstance(r, ast.Raise) and isinstance(r.exc, ast.Call)
+            ]
             missing += [f"{place} raises {k}" for k in {ast.unparse(r.func) for r in raises} & OURS - known]
     assert not missing, "\n".join(missing)

@@ -8,19 +8,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from arms import within_arms_length
 from conftest import refusal, wall_of
 from synthetic import FEW_VIEWS, model_of, simulated_scene, simulated_views
 
-from caryatid.config import ArmConfig
 from caryatid.errors import InputError, NoSurfaceError, PlanningError
 from caryatid.exploration import Explorer, explore, next_best_view
 from caryatid.geometry import transforms
+from caryatid.graph import SupportGraph
 from caryatid.io import read_recording, write_recording
 from caryatid.io.graph_json import graph_text
 from caryatid.robots import Unreachable
-from caryatid.robots.arm import ArmRobot
-from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.robots.recording import RecordingCamera, RecordingRobot
 from caryatid.scene import Scene
 from caryatid.simulation.setup import make_simulation
@@ -115,13 +112,8 @@ def test_the_next_view_can_be_asked_for_alone():
     assert (alone.index, alone.score, alone.waypoints) == (given.index, given.score, ())
     far = poses.copy()
     far[:, :3, 3] *= 1000.0
-    for wrong, named in (
-        (far, "candidates"),
-        ("left", "candidates"),
-        (poses[:, :3], "candidates"),
-        (2.0 * poses, "candidates[0]"),
-    ):
-        with refusal(named):
+    for wrong in (far, "left", poses[:, :3], 2.0 * poses):
+        with refusal("candidates"):
             next_best_view(scene, candidates=wrong)
     with pytest.raises(PlanningError):
         next_best_view(scene, candidates=np.zeros((0, 4, 4)))
@@ -142,48 +134,21 @@ def test_the_next_view_can_be_asked_for_alone():
 
 
 def test_a_robot_may_return_poses_alone():
-    class Bare(RecordingRobot):
-        def candidates(self, sphere):
-            return super().candidates(sphere).T_world_camera
-
     views = simulated_views("tower")
-    robots = (kind([v.pose for v in views]) for kind in (RecordingRobot, Bare))
-    first, second = (next_best_view(model_of(views[:1], FEW_VIEWS), robot) for robot in robots)
-    np.testing.assert_array_equal(first.T_world_camera, second.T_world_camera)
+    first, bare = (RecordingRobot([v.pose for v in views]) for _ in range(2))
+    bare.candidates = lambda sphere: first.candidates(sphere).T_world_camera
+    one, other = (next_best_view(model_of(views[:1], FEW_VIEWS), robot) for robot in (first, bare))
+    np.testing.assert_array_equal(one.T_world_camera, other.T_world_camera)
 
 
 class Shy:
-    """A robot whose motion planner fails three times in ten, when it checks and when it moves."""
+    """The protocol alone, around a robot whose motion planner fails three times in ten."""
 
-    def __init__(self, rng, *given):
-        super().__init__(*given)
-        self.rng = rng
+    def __init__(self, robot, seed):
+        self.robot, self.rng = robot, np.random.default_rng(seed)
 
     def fails(self):
         return self.rng.random() < 0.3
-
-    def confirm(self, T_world_camera):
-        return Unreachable("no path found") if self.fails() else super().confirm(T_world_camera)
-
-    def move_to(self, T_world_camera):
-        if self.fails():
-            raise PlanningError("the motion stopped")
-        return super().move_to(T_world_camera)
-
-
-class ShyHumanoid(Shy, HumanoidRobot):
-    pass
-
-
-class ShyArm(Shy, ArmRobot):
-    pass
-
-
-class Bare:
-    """The protocol alone, around another robot."""
-
-    def __init__(self, robot):
-        self.robot, self.fails = robot, robot.fails
 
     @property
     def T_world_camera(self):
@@ -196,31 +161,15 @@ class Bare:
         return Unreachable("no path found") if self.fails() else self.robot.solve(T_world_camera)
 
     def move_to(self, T_world_camera):
+        if self.fails():
+            raise PlanningError("the motion stopped")
         return self.robot.move_to(T_world_camera)
 
 
-def shy_robot(kind, seed):
-    """Makes a robot of one of three kinds."""
-    rng = np.random.default_rng(seed)
-
-    def made(around):
-        if kind == "arm":
-            T_world_base = transforms.rigid(np.eye(3), around.centre_world + np.array([-0.5, 0.0, 0.0]))
-            config = ArmConfig(sphere_points=600, radius_views=200)
-            return ShyArm(rng, within_arms_length, T_world_base, config)
-        robot = ShyHumanoid(rng, around.floor, around.config.robot)
-        return Bare(robot) if kind == "bare" else robot
-
-    return made
-
-
-@pytest.mark.parametrize("kind", ["arm", "humanoid", "bare"])
-@pytest.mark.parametrize("scene", ["tower", "bridge"])
-def test_motions_that_fail_do_not_end_it(kind, scene, caplog):
+def test_motions_that_fail_do_not_end_it(caplog):
     for seed in range(4):
-        maker = shy_robot(kind, seed)
-        set_up = make_simulation(simulated_scene(scene), FEW_VIEWS, noise="none", seed=seed, robot=maker)
-        steps = list(explore(set_up.camera, set_up.robot, config=FEW_VIEWS, early_stop=False))
+        set_up = make_simulation(simulated_scene("tower"), FEW_VIEWS, noise="none", seed=seed)
+        steps = list(explore(set_up.camera, Shy(set_up.robot, seed), config=FEW_VIEWS, early_stop=False))
         assert [step.index for step in steps] == [0, 1, 2]
         assert steps[-1].stop == "maximum of 3 views reached"
     assert "put aside: the motion stopped" in caplog.text
@@ -323,31 +272,27 @@ def written(folder, steps):
 
 def test_steps_come_back_from_a_run_folder_as_they_were(steps, tmp_path):
     run = written(tmp_path / "run", steps)
-    found = list(read_steps(run))
-    assert len(found) == len(steps)
     ends = run.views[0].record["next"]["waypoints"][-1]
     np.testing.assert_allclose(ends["platform"], steps[0].decision.waypoints[-1].platform_world, atol=1e-8)
-    for step, read in zip(steps, found, strict=True):
-        assert repr(read) == repr(step)
-        assert graph_text(read.graph) == graph_text(step.graph)
-        for part in ("view", "candidates", "decision", "robot", "cloud", "sphere"):
-            one, other = getattr(step, part), getattr(read, part)
-            assert (one is None) == (other is None)
-            for field in () if one is None else fields(one):
-                if not field.name.startswith("_"):
-                    check_same(getattr(one, field.name), getattr(other, field.name))
-        for name in ("name", "labels", "visited", "timings", "angle_travelled", "path_travelled", "stop"):
-            check_same(getattr(step, name), getattr(read, name))
+    for step, read in zip(steps, read_steps(run), strict=True):
+        check_same(step, read)
 
 
 def check_same(one, other):
+    """The same content, arrays to a micrometre, whatever is kept of it for speed."""
+    assert type(one) is type(other)
     if isinstance(one, np.ndarray):
         assert one.dtype == other.dtype
         np.testing.assert_allclose(one, other, atol=1e-6)
     elif isinstance(one, tuple):
-        assert [repr(item) for item in one] == [repr(item) for item in other]
+        for pair in zip(one, other, strict=True):
+            check_same(*pair)
+    elif isinstance(one, SupportGraph):
+        assert graph_text(one) == graph_text(other)
     elif is_dataclass(one):
-        assert repr(one) == repr(other)
+        for field in fields(one):
+            if not field.name.startswith("_"):
+                check_same(getattr(one, field.name), getattr(other, field.name))
     else:
         assert one == other
 

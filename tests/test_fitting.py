@@ -7,13 +7,12 @@ from itertools import product
 
 import numpy as np
 import pytest
-from synthetic import box, cylinder, hausdorff, seen_free, sphere, surface_points
+from synthetic import box, cylinder, hausdorff, random_motion, seen_free, sphere, surface_points
 
 from caryatid.config import FitConfig
 from caryatid.fitting import primitives
-from caryatid.fitting.hidden_faces import close_hidden_faces, deviations
+from caryatid.fitting.hidden_faces import close_hidden_faces
 from caryatid.fitting.primitives import Fit, FitFailure, candidates, fit, free_inside
-from caryatid.geometry import BOX as BOX_CODE
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder
 
@@ -103,27 +102,6 @@ def test_one_face_alone_makes_a_slab_behind_it():
     assert sum(result.seen) == 1
 
 
-@pytest.mark.parametrize("columns", [16, 24, 30, 40])
-def test_that_points_come_in_rows_does_not_show(columns):
-    """Every second, third or fourth point of a face would leave out its last columns."""
-    u, v = np.meshgrid(np.linspace(-0.06, 0.06, columns), np.linspace(-0.05, 0.05, 20))
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        rows = np.stack([u.ravel(), v.ravel(), 0.0005 * rng.normal(size=u.size)], axis=1)
-        up = noisy_normals(np.tile((0.0, 0.0, 1.0), (u.size, 1)), rng)
-        boxes = [f for f in candidates_of(rows, up, seed=seed) if f.shape.kind == "box"]
-        np.testing.assert_allclose(np.sort(boxes[0].shape.extents)[1:], (0.1, 0.12), atol=0.002)
-
-
-def test_points_of_two_shapes_are_a_poor_fit():
-    rng = np.random.default_rng(0)
-    bars = [box((0.0, 0.0, 0.0), (0.2, 0.02, 0.02)), box((0.09, 0.09, 0.06), (0.02, 0.2, 0.02))]
-    parts = [surface_points(b, rng, sigma=0.001) for b in bars]
-    strict = replace(CONFIG, max_residual=0.002)
-    assert fit_of(*map(np.concatenate, zip(*parts, strict=True)), config=strict).poor
-    assert not fit_of(*parts[0], config=strict).poor
-
-
 @pytest.mark.parametrize("count", [0, 3, CONFIG.min_points - 1])
 def test_too_few_points_are_a_clear_failure(count):
     points, normals = surface_points(SHAPES[0], np.random.default_rng(0))
@@ -134,7 +112,7 @@ def test_too_few_points_are_a_clear_failure(count):
     assert fit(points, normals, config=CONFIG, rng=np.random.default_rng(0)) == result
 
 
-def test_nothing_is_bigger_than_what_stands_on_a_table():
+def test_what_is_too_large_is_a_clear_failure():
     points, normals = surface_points(box((0, 0, 0), (0.9, 0.8, 0.7)), np.random.default_rng(0), spacing=0.03)
     result = fit(points, normals, config=CONFIG, rng=np.random.default_rng(0))
     assert isinstance(result, FitFailure)
@@ -160,15 +138,20 @@ def test_only_the_shapes_that_are_asked_for_are_tried(kind, shape):
 
 
 @each
-def test_a_kilometre_away_it_is_the_same_shape(shape):
-    """Coordinates have 1e-13 m of rounding there, and the shape moves with them."""
+def test_a_fit_does_not_depend_on_where_the_points_lie_and_in_which_order(shape):
+    """Coordinates have 1e-13 m of rounding a kilometre away, and the shape moves with them."""
     rng = np.random.default_rng(0)
     points, normals = surface_points(shape, rng, eye=EYE, sigma=0.002)
     normals = noisy_normals(normals, rng)
-    far = transforms.rigid(np.eye(3), (1000.0, -1000.0, 1000.0))
-    here, there = fit_of(points, normals).shape, fit_of(transforms.transform(far, points), normals).shape
-    assert there.kind == here.kind
-    assert hausdorff(there, here.moved(far)) < 1e-6
+    here = fit_of(points, normals)
+    for T in (transforms.rigid(np.eye(3), (1000.0, -1000.0, 1000.0)), random_motion(rng, 2.0)):
+        there = fit_of(transforms.transform(T, points), transforms.rotate(T, normals)).shape
+        assert there.kind == here.shape.kind
+        assert hausdorff(there, here.shape.moved(T)) < 1e-5
+    order = rng.permutation(len(points))  # Other samples are drawn: the best of them are refined.
+    shuffled = fit_of(points[order], normals[order])
+    assert shuffled.shape.kind == here.shape.kind
+    assert abs(shuffled.residual - here.residual) < 0.0005
 
 
 def test_arrays_of_any_layout_give_the_same_fit():
@@ -269,18 +252,6 @@ def test_the_height_of_a_can_is_that_of_its_mantle():
     assert uncertainty.rotation[2] > 0.5 > 0.02 > uncertainty.rotation[:2].max()
 
 
-def test_the_radius_of_a_disc_is_where_it_ends():
-    rng = np.random.default_rng(0)
-    angle, reach = rng.uniform(0.0, 2.0 * np.pi, 1500), 0.04 * np.sqrt(rng.uniform(size=1500))
-    points = np.stack([reach * np.cos(angle), reach * np.sin(angle), np.full(1500, 0.06)], axis=1)
-    points += 0.002 * rng.normal(size=points.shape)
-    disc = cylinder((0.0, 0.0, 0.055), 0.042, 0.01)
-    found, uncertainty = closed(disc, np.arange(6) == 5, points)
-    assert found.extents[0] == pytest.approx(0.08, abs=0.0015)
-    assert uncertainty.sizes[0] < 0.003
-    assert uncertainty.sides[4] > 0.1
-
-
 def test_errors_are_as_large_as_the_standard_deviations_say():
     """At least four in five, and not all, within twice what is claimed, which is little."""
     errors, claims = [], []
@@ -306,24 +277,6 @@ def test_a_side_that_nothing_bears_out_may_be_anywhere():
     np.testing.assert_allclose(found.extents[:2], BOX.extents[:2], atol=0.001)
 
 
-def test_what_no_number_of_points_averages_out_is_the_least_deviation():
-    points = two_faces(0)
-    careful = replace(INDEPENDENT, registration=0.004)
-    _, plain = closed(BOX, TWO_FACES, points)
-    _, floored = closed(BOX, TWO_FACES, points, careful)
-    np.testing.assert_allclose(floored.sides, np.hypot(plain.sides, 0.004), rtol=1e-6)
-    assert (floored.sizes > plain.sizes).all()
-    assert (floored.position > plain.position).all()
-
-
-def test_deviations_are_numbers_where_rounding_makes_a_variance_negative():
-    information = np.diag(np.full(9, 1e12))
-    information[0, 6] = information[6, 0] = 1e12 * (1.0 + 1e-10)
-    found = deviations(BOX_CODE, np.zeros((3, 2)), information, INDEPENDENT)
-    for each in (found.position, found.rotation, found.sizes, found.sides):
-        assert np.isfinite(each).all()
-
-
 INSET = 0.012
 
 
@@ -338,15 +291,6 @@ def test_half_of_a_shape_in_free_space_is_half_free(shape):
         voxels = seen_free(lambda p, start=start: p[:, 0] > start)
         inside, free = free_inside(shape, voxels, INSET)
         assert free / inside == share
-
-
-def test_the_surface_says_nothing():
-    shape = box((0.0, 0.0, 0.2), (0.2, 0.2, 0.2))
-    skin = seen_free(lambda p: np.abs(shape.signed_distance(p)) < 0.005)
-    inside, free = free_inside(shape, skin, INSET)
-    assert inside > 1000
-    assert free == 0
-    assert free_inside(box((0.0, 0.0, 0.2), (0.2, 0.2, 0.02)), skin, INSET) == (0, 0)
 
 
 def test_of_shapes_that_explain_the_points_the_one_that_fills_no_space_seen_free(monkeypatch):

@@ -1,18 +1,26 @@
 from __future__ import annotations
 
-import copy
-import pickle
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
-from synthetic import box, cylinder, edges, sphere, table_object, thing, vertices
+from synthetic import (
+    box,
+    cylinder,
+    edges,
+    hausdorff,
+    random_motion,
+    sphere,
+    table_object,
+    thing,
+    vertices,
+)
 
 from caryatid.config import FusionConfig
-from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Uncertainty
+from caryatid.geometry.shapes import Box
 from caryatid.graph import Support, SupportGraph
-from caryatid.objects.fusion import changed, fuse, fused_graph, match, renamed, reshaped
+from caryatid.objects.fusion import changed, fuse, fused_graph, match, merged_sightings
 
 SG, PC, BOTH = (FusionConfig(method=m) for m in ("sg", "pc", "pc+sg"))
 CRATE = box((0.0, 0.0, 0.8), (0.1, 0.12, 0.1))
@@ -81,15 +89,6 @@ def test_place_size_and_orientation_tell_whether_two_are_the_same(known, seen, s
     assert match([thing(1, known)], [thing(9, seen)], SG, same_labels=False) == ({"o9": "o1"} if same else {})
 
 
-def test_a_sighting_that_is_unsure_of_a_hidden_side_may_differ_by_it():
-    deep, cut = box((0.055, 0.0, 0.8), (0.24, 0.12, 0.1)), box((0.0, 0.0, 0.8), (0.13, 0.12, 0.1))
-    unsure = Uncertainty(np.array([0.04, 0.0, 0.0]), np.zeros(3), np.array([0.08, 0.0, 0.0]), np.zeros(6))
-    shallow = thing(9, cut)
-    assert match([thing(1, deep)], [shallow], SG, same_labels=False) == {}
-    shallow = replace(shallow, uncertainty=unsure)
-    assert match([thing(1, deep)], [shallow], SG, same_labels=False) == {"o9": "o1"}
-
-
 def test_each_is_matched_to_one_and_all_together_as_well_as_can_be():
     first, second = CRATE, CRATE.moved(shift(0.04))
     known = [thing(1, first), thing(2, second)]
@@ -99,21 +98,6 @@ def test_each_is_matched_to_one_and_all_together_as_well_as_can_be():
     for places in ([thing(1, BOXED), thing(2, CAN)], [thing(1, CAN), thing(2, BOXED)]):
         found = match(places, [thing(9, CAN)], SG, same_labels=False)["o9"]
         assert {o.id: o.shape.kind for o in places}[found] == "cylinder"
-
-
-def test_the_table_is_the_table_and_no_object():
-    known = [table_object(0.75), thing(1, CRATE)]
-    seen = [table_object(0.9)]
-    assert match(known, seen, SG, same_labels=False) == {"o0": "o0"}
-    assert match([thing(1, table_object().shape)], seen, SG, same_labels=False) == {}
-
-
-def test_labels_alone_decide_where_they_mean_the_same_in_every_view():
-    far = thing(1, CRATE.moved(shift(0.5)))
-    assert match([thing(1, CRATE)], [far], SG, same_labels=True) == {"o1": "o1"}
-    assert match([thing(1, CRATE)], [thing(2, CRATE)], SG, same_labels=True) == {}
-    for known, seen in (([], [far]), ([far], [])):
-        assert match(known, seen, SG, same_labels=False) == {}
 
 
 # Fusing
@@ -181,15 +165,11 @@ def test_which_edges_each_method_keeps_found_in_views_true_and_not_in_views_fals
     assert (("o1", "o2") in edges(fused_of(*graphs, config=mild))) == any(found)
 
 
-def test_pc_holds_what_the_newest_graph_holds():
-    for config, there in ((PC, False), (SG, True), (BOTH, True)):
-        assert ("o2" in vertices(fused_of(FULL, GONE, config=config))) == there
-
-
-def test_sg_merges_the_shapes_and_the_others_take_the_newest():
+def test_sg_merges_the_shapes_and_pc_holds_what_the_newest_graph_holds():
     shifted = graph(shapes={1: CRATE.moved(shift(0.01)), 2: CAN})
-    for config, x in ((SG, 0.005), (PC, 0.01), (BOTH, 0.01)):
+    for config, x, stays in ((SG, 0.005, True), (PC, 0.01, False), (BOTH, 0.01, True)):
         assert fused_of(FULL, shifted, config=config)["o1"].centre_world[0] == pytest.approx(x)
+        assert ("o2" in vertices(fused_of(FULL, GONE, config=config))) == stays
 
 
 def test_an_edge_is_certain_where_a_view_was_certain_of_it():
@@ -198,29 +178,6 @@ def test_an_edge_is_certain_where_a_view_was_certain_of_it():
         assert fused_of(*order).support("o1", "o2").certain
     assert not fused_of(unsure, unsure).support("o1", "o2").certain
     assert not fused_of(FULL, unsure, config=BOTH).support("o1", "o2").certain
-
-
-def test_edges_of_an_object_taken_for_another_count_for_the_other():
-    twice = graph(("o0", "o1"), ("o1", "o2"), ("o0", "o3"), ("o3", "o1"), shapes={1: CRATE, 2: CAN, 3: CRATE})
-    views = [graph(("o3", "o2"), shapes={2: CAN, 3: CRATE}), twice]
-    fused = fused_graph(tuple(renamed(view, {"o3": "o1"}) for view in views), BOTH)
-    assert {o.id: (o.label, o.occurrences) for o in fused.objects[1:]} == {"o1": (1, 2), "o2": (2, 2)}
-    assert {s.pair: s.occurrences for s in fused.supports} == {("o1", "o2"): 2, ("o0", "o1"): 1}
-
-
-@pytest.mark.parametrize("config", [PC, BOTH], ids=lambda c: c.method)
-def test_earlier_graphs_share_what_the_later_ones_replace(config):
-    sizes = [
-        len(pickle.dumps(together(*[copy.deepcopy(FULL) for _ in range(n)], config=config))) for n in (5, 25)
-    ]
-    assert sizes[1] - sizes[0] < 20 * len(pickle.dumps(FULL)) / 4
-
-
-def test_a_support_that_only_earlier_graphs_have_keeps_its_reason():
-    held = together(FULL, FULL, FULL, config=BOTH)
-    # A report of the robot replaces the newest graph.
-    fused = fused_graph((*held[:-1], graph(("o0", "o1"))), BOTH)
-    assert [s.why for s in fused.supports if s.pair == ("o1", "o2")] == ["o1>o2"]
 
 
 def test_a_support_that_a_view_lacks_is_doubtful():
@@ -255,32 +212,15 @@ def with_crate(shape):
     return graph(("o0", "o1"), ("o1", "o2"), shapes={1: shape, 2: CAN})
 
 
-def shifted(shape, by):
-    return shape.moved(shift(by))
+@pytest.mark.parametrize("part", ["place", "size"])
+def test_a_shape_changes_only_beyond_the_tolerance(part):
+    def crate(by):
+        grown = Box(CRATE.T_world_object, CRATE.extents + (0.0, 0.0, by))
+        return with_crate(CRATE.moved(shift(by)) if part == "place" else grown)
 
-
-def grown(shape, by):
-    return Box(shape.T_world_object, shape.extents + (0.0, 0.0, by))
-
-
-def turned(shape, by):
-    """Turned so that the ends of the longest edge move by this much."""
-    angle = by / (shape.extents.max() / 2.0)
-    R = transforms.rotation_from_vector((angle, 0.0, 0.0))
-    return replace(shape, T_world_object=shape.T_world_object @ transforms.rigid(R, np.zeros(3)))
-
-
-@pytest.mark.parametrize("change", [shifted, grown, turned])
-def test_a_shape_changes_only_beyond_the_tolerance(change):
-    assert not changed(FULL, with_crate(change(CRATE, LITTLE)), SG)
-    assert changed(FULL, with_crate(change(CRATE, MUCH)), SG)
-    assert not changed(FULL, with_crate(change(CRATE, MUCH)), replace(SG, settled=2.0 * MUCH))
-
-
-def test_the_kind_of_a_shape_is_a_change_and_the_names_of_its_axes_are_none():
-    assert changed(FULL, with_crate(cylinder((0.0, 0.0, 0.8), 0.05, 0.1)), SG)
-    assert not changed(FULL, with_crate(Box(on_its_side(CRATE).T_world_object, CRATE.extents[[2, 0, 1]])), SG)
-    assert not reshaped(thing(3, BALL), thing(3, turned(BALL, 0.05)), SG)
+    assert not changed(FULL, crate(LITTLE), SG)
+    assert changed(FULL, crate(MUCH), SG)
+    assert not changed(FULL, crate(MUCH), replace(SG, settled=2.0 * MUCH))
 
 
 @pytest.mark.parametrize(
@@ -297,8 +237,25 @@ def test_objects_and_edges_that_come_or_go_are_a_change(other):
     assert changed(other, FULL, SG)
 
 
-def test_more_evidence_and_more_of_the_table_are_no_change():
-    counted = tuple(replace(s, occurrences=5, opportunities=7, certain=False) for s in FULL.supports)
-    wider = replace(table_object(), shape=box((0.0, 0.0, 0.73), (0.9, 1.3, 0.04)))
-    for same in (replace(FULL, supports=counted), replace(FULL, objects=(wider, *FULL.objects[1:]))):
-        assert not changed(FULL, same, SG)
+# Shapes of several sightings, with `sg`
+
+NONE = (False,) * 6
+
+
+def test_the_kind_with_most_evidence_wins():
+    ball, crate = sphere((0.0, 0.0, 0.0), 0.05), box((0.0, 0.0, 0.0), (0.09, 0.09, 0.09))
+    assert merged_sightings([thing(1, ball), thing(1, crate), thing(1, crate)]).shape.kind == "box"
+    assert merged_sightings([thing(1, ball), thing(1, crate, seen=NONE)]).shape.kind == "sphere"
+    balls = [thing(1, sphere((x, 0.0, 0.0), radius)) for x, radius in ((0.0, 0.04), (0.02, 0.05))]
+    assert hausdorff(merged_sightings(balls).shape, sphere((0.01, 0.0, 0.0), 0.045)) < 1e-12
+
+
+def test_merging_commutes_with_any_motion_and_any_order():
+    sightings = [
+        thing(1, box((0.0, 0.0, 0.0), (0.08, 0.12, 0.1), turn_deg=3.0 * k), seen=(True, k == 0) * 3)
+        for k in range(3)
+    ]
+    T, merged = random_motion(np.random.default_rng(2)), merged_sightings(sightings)
+    for order in permutations(sightings):
+        there = [replace(o, shape=o.shape.moved(T)) for o in order]
+        assert hausdorff(merged_sightings(there).shape, merged.shape.moved(T)) < 1e-12

@@ -34,28 +34,19 @@ def test_background_crumbs_and_doubtful_masks_are_left_out():
     assert np.unique(labels).tolist() == [0, 3]
 
 
-def test_of_two_equal_masks_the_better_stays():
+def test_what_is_nearly_the_same_nearly_covered_too_small_or_nothing_is_left_out():
     masks = [square(5, 30), square(5, 31)]
     assert np.unique(labels_from_masks(masks, [0.7, 0.9])).tolist() == [0, 2]
     assert np.unique(labels_from_masks(masks)).tolist() == [0, 1]
-
-
-def test_a_mask_nearly_covered_by_smaller_ones_leaves_no_crumbs():
     cover = square(5, 30)
     low, high = cover.copy(), cover.copy()
     low[:18], high[17:] = False, False
     labels = labels_from_masks([cover, low, high], config=MaskConfig(LEAST))
     assert np.unique(labels).tolist() == [0, 2, 3]
-
-
-def test_what_is_too_small_depends_on_the_size_of_the_image():
     for size, kept in ((60, True), (600, False)):
         mask = np.zeros((1, size, size), dtype=bool)
         mask[:, :10, :10] = True
         assert labels_from_masks(mask).any() == kept
-
-
-def test_a_segmenter_may_find_nothing():
     assert not labels_from_masks(np.zeros((0, 60, 60), dtype=bool)).any()
 
 

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import TABLE_TOP, motion_about_vertical, simulated_cloud, simulated_views
+from synthetic import TABLE_TOP, simulated_cloud, simulated_views
 
 from caryatid.config import Config
 from caryatid.errors import InputError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.segmentation.observation import level_transform, observe
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+from caryatid.sensing.views import Cloud, View
 
 CONFIG = Config()
 VIEW = simulated_views("tower")[0]
@@ -20,10 +20,6 @@ def observation_of(source, segmentation=None, known=None, config=CONFIG):
     return observe(source, config, segmentation=segmentation, known=known, rng=np.random.default_rng(0))
 
 
-def without_pose(view):
-    return replace(view, T_world_camera=None)
-
-
 def test_labelled_points_below_the_known_table_are_kept():
     known = observation_of(VIEW).surface
     floor = observation_of(VIEW, "labels")
@@ -31,24 +27,6 @@ def test_labelled_points_below_the_known_table_are_kept():
     labels = VIEW.labels.copy()
     labels.ravel()[pixels] = 77
     assert (observation_of(replace(VIEW, labels=labels), "labels", known=known).labels == 77).sum() == 500
-
-
-def test_a_view_without_a_pose_gets_a_level_world_on_the_table():
-    observation = observation_of(without_pose(VIEW))
-    T_world_camera = observation.view.pose
-    on_objects = VIEW.labels > 0
-    heights = transforms.transform(T_world_camera, VIEW.points_camera)[on_objects][:, 2]
-    true = transforms.transform(VIEW.pose, VIEW.points_camera)[on_objects][:, 2] - TABLE_TOP
-    np.testing.assert_allclose(heights, true, atol=0.002)
-    np.testing.assert_allclose(T_world_camera[:2, 3], 0.0, atol=1e-12)
-    assert observation.surface.point_world[2] == pytest.approx(0.0, abs=0.001)
-
-
-def test_automatic_parts_are_found_without_looking_at_labels():
-    (view,) = simulated_views("hidden_stack", (0.0,), vga=True)
-    observation = observation_of(replace(view, labels=None), "auto")
-    np.testing.assert_array_equal(observation.labels, observation_of(view, "auto").labels)
-    assert len(observation.shown) >= 6
 
 
 @pytest.mark.parametrize("source", [VIEW, simulated_cloud("tower")], ids=["view", "cloud"])
@@ -89,21 +67,6 @@ def test_the_table_is_looked_for_near_where_it_was():
     T[2, 3] += 0.01
     shifted = observation_of(replace(VIEW, T_world_camera=T), known=known)
     assert shifted.surface.point_world[2] == pytest.approx(TABLE_TOP + 0.01, abs=0.001)
-
-
-def test_new_names_replace_old_ones_all_at_once():
-    observation = observation_of(VIEW, "labels")
-    swapped = observation.relabelled({1: 2, 2: 1, 5: 9})
-    for old, new in ((1, 2), (2, 1), (3, 3), (5, 9), (SUPPORT_LABEL, SUPPORT_LABEL)):
-        np.testing.assert_array_equal(swapped.labels == new, observation.labels == old)
-    assert not (observation.labels == 9).any()
-
-
-def test_the_table_moves_with_an_observation():
-    here = observation_of(VIEW)
-    there = here.moved(motion_about_vertical(np.random.default_rng(0)))
-    heights = (o.surface.height(o.cloud.points_world) for o in (here, there))
-    np.testing.assert_allclose(*heights, atol=1e-12)
 
 
 def test_a_cloud_in_its_sensors_frame_is_levelled():

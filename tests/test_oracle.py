@@ -16,8 +16,6 @@ from caryatid.evaluation.oracle import OraclePlanner, planner_for, spread_out
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
-from caryatid.geometry import transforms
-from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.io.graph_json import graph_text
 from caryatid.planning.planners import make_planner
 from caryatid.simulation.setup import make_simulation
@@ -87,28 +85,6 @@ def test_none_of_the_views_it_tries_would_have_been_better(explored):
     others = [exploration(Chosen([index]), config=config)[1][1] for index in tried]
     assert f1[1] == max(others)
     assert min(others) < max(others)
-
-
-@pytest.mark.slow
-def test_of_equal_views_it_takes_the_one_that_shows_most_unseen_surface():
-    """Where any overlap makes an object a true one, F1 is 1 from everywhere."""
-    config = replace(CONFIG, evaluation=replace(CONFIG.evaluation, min_iou=0.0))
-    (first, second, _), _ = exploration("oracle", "tower", config)
-    assert first.decision.saliency == 1.0
-    assert transforms.angle_between(first.visited[0], second.visited[1]) > np.pi / 3.0
-
-
-def test_views_to_try_are_spread_over_all_there_are():
-    directions = fibonacci_sphere(2000)
-    visited = directions[:1]
-    picked = spread_out(directions, visited, 32)
-    assert len(set(picked)) == 32
-    apart = transforms.angle_between(directions[picked][:, None], directions[picked][None])
-    assert apart[~np.eye(32, dtype=bool)].min() > np.deg2rad(25.0)
-    assert transforms.angle_between(directions[picked], visited).min() > np.deg2rad(25.0)
-    covered = transforms.angle_between(directions[:, None], directions[picked][None]).min(axis=1)
-    assert covered.max() < np.deg2rad(35.0)
-    assert sorted(spread_out(directions[:5], visited, 32)) == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("wrong", ["camera", "seed"])

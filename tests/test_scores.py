@@ -13,10 +13,8 @@ from synthetic import box, sphere, table_object, thing
 from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.evaluation import as_scene, evaluate_run, score, score_masks
-from caryatid.evaluation.scores import Forecast, average_precision
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box
-from caryatid.graph import SceneObject, Support, SupportGraph
+from caryatid.graph import Support, SupportGraph
 from caryatid.io import write_recording
 from caryatid.sensing.views import SUPPORT_LABEL, View
 from caryatid.simulation import load_scene, true_shapes
@@ -106,38 +104,6 @@ def test_probabilities_by_hand():
     strange = Support("o0", "o9", probability=0.9)
     aside = SupportGraph((*objects, thing(9, sphere((0.4, 0.0, 0.8), 0.05))), (*supports, strange))
     assert (score(aside, truth).brier, score(aside, truth).average_precision) == (0.0, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("said", "expected"),
-    [
-        ([], 1.0),
-        ([(0.3, False)], 0.0),
-        ([(0.0, True)], 0.0),
-        ([(0.5, True), (0.5, False)], 0.5),
-        ([(0.5, False), (0.4, True), (0.0, True)], 0.25),
-    ],
-)
-def test_average_precision_of_few(said, expected):
-    assert average_precision([Forecast(p, true) for p, true in said]) == expected
-
-
-def turned(extents, *degrees):
-    R = transforms.rotation_from_vector(np.deg2rad(degrees))
-    return Box(transforms.rigid(R, (0.0, 0.0, 0.7)), np.array(extents))
-
-
-@pytest.mark.parametrize(
-    ("shape", "height"),
-    [
-        (turned((1.0, 1.0, 0.04), 2.0, 0.0, 0.0), 0.72),
-        (turned((0.04, 1.0, 1.0), 0.0, 90.0, 0.0), 0.72),
-        (sphere((0.0, 0.0, 1.0), 0.1), 1.1),
-    ],
-)
-def test_the_top_of_a_tilted_table_is_measured_in_its_middle(shape, height):
-    graph = SupportGraph((SceneObject("o0", SUPPORT_LABEL, shape, role="support_surface"),))
-    assert as_scene(graph).table_top == pytest.approx(height, abs=1e-4)
 
 
 TRUE_LABELS = np.zeros((20, 20), np.int32)

@@ -109,16 +109,6 @@ def test_carmine_has_no_normals_a_wrong_pose_after_the_first_and_all_labels(clut
     assert (clean.valid & ~second.valid & (clean.labels > 0)).any()
 
 
-def test_a_fork_sees_with_the_noise_that_is_next_and_leaves_the_camera_alone(clutter):
-    cameras = [camera(clutter, "carmine") for _ in range(2)]
-    for one in cameras:
-        one.capture(FROM_THE_ROBOT)
-    forked = [cameras[0].fork().capture(FROM_THE_ROBOT) for _ in range(2)]
-    after, untouched = (one.capture(FROM_THE_ROBOT) for one in cameras)
-    for view in (*forked, after):
-        assert_same(view, untouched)
-
-
 @pytest.mark.parametrize("z", [0.6, 1.5, 2.5])
 def test_axial_noise_has_the_published_size_and_depths_are_quantised(z):
     found = noisy(np.full((200, 200), z))

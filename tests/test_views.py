@@ -27,16 +27,6 @@ def test_missing_readings_are_zero_whether_given_as_zero_or_nan():
     assert np.isnan(given[0, 1]), "the depth handed in must stay as it was"
 
 
-def test_points_project_back_to_their_pixels_at_their_depth():
-    view = View(DEPTH, K)
-    points = view.points_camera
-    v, u = np.mgrid[0:4, 0:5]
-    projected = points @ K.T
-    np.testing.assert_allclose(projected[..., 0] / projected[..., 2], u, atol=1e-9)
-    np.testing.assert_allclose(projected[..., 1] / projected[..., 2], v, atol=1e-9)
-    np.testing.assert_allclose(points[..., 2], DEPTH, atol=1e-7)
-
-
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
@@ -63,15 +53,12 @@ def test_a_view_that_makes_no_sense_is_refused_by_name_and_reason(fields, reason
     assert caught.value.remedy
 
 
-def test_the_highest_label_below_the_support_surfaces_is_allowed():
-    view = View(DEPTH, K, labels=np.full((4, 5), SUPPORT_LABEL - 1, dtype=np.uint16))
+def test_the_highest_label_below_the_support_surfaces_is_allowed_and_a_missing_pose_is_asked_for_by_name():
+    view = View(DEPTH, K, labels=np.full((4, 5), SUPPORT_LABEL - 1, dtype=np.uint16), name="frame 3")
     assert view.labels.dtype == np.int32
     assert (view.labels == SUPPORT_LABEL - 1).all()
-
-
-def test_a_pose_that_is_not_known_is_asked_for_by_name():
     with pytest.raises(InputError, match="frame 3: has no camera pose"):
-        _ = View(DEPTH, K, name="frame 3").pose
+        _ = view.pose
 
 
 def test_points_are_picked_with_all_that_belongs_to_them():

@@ -96,11 +96,3 @@ def test_shapes_are_solid_inside_and_only_there():
     np.testing.assert_array_equal(inside, ball.signed_distance(centres) < 0.0)
     outside = Sphere(transforms.rigid(np.eye(3), (3.0, 0.0, 0.1)), 0.1)
     assert not VoxelMap.around((0.0, 0.0, 0.0), CONFIG).occluders([outside]).grid.any()
-
-
-def test_what_was_never_hit_is_not_occupied_however_misses_count():
-    hits, passes = np.zeros((2, 3, 1, 1), dtype=np.uint8)
-    hits[2], passes[1:] = 1, 9
-    voxels = VoxelMap(np.zeros(3), hits, passes, VoxelConfig(miss=0.5))
-    assert voxels.states.ravel().tolist() == [UNKNOWN, FREE, OCCUPIED]
-    assert voxels.occluders().grid.shape == (1, 1, 1)
