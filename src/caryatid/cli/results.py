@@ -212,7 +212,7 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
     from caryatid.io.staging import write_file
     from caryatid.sessions.reading import open_run
     from caryatid.steps import read_config, read_steps
-    from caryatid.viz.pdf import render_pdf
+    from caryatid.viz.pdf import print_pdf
     from caryatid.viz.report import make_report, read_lifts, render_html
 
     with open_run(folder) as run:
@@ -231,8 +231,9 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
             warnings=record.get("warnings", ()),
             config=config.report,
         )
-    files = {} if pdf is None else {pdf: render_pdf(report)}
-    files[folder / "report.html"] = render_html(report).encode()
+    page = render_html(report)
+    files = {} if pdf is None else {pdf: print_pdf(page)}
+    files[folder / "report.html"] = page.encode()
     for path, content in files.items():
         write_file(path, content)
     return list(files)

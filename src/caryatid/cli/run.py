@@ -294,7 +294,7 @@ class Clear(options.LiftingCommand, options.ExploringCommand):
         from caryatid.runtime.parallel import cores
         from caryatid.simulation.camera import SimulatedCamera
         from caryatid.steps import RunWriter, lift_file, read_steps
-        from caryatid.viz.report import draw_lift, lift_picture
+        from caryatid.viz.report import draw_lift
         from caryatid.viz.tables import count_of
 
         config, seed, output = self.config(), self.settings.seed, self.output
@@ -329,8 +329,8 @@ class Clear(options.LiftingCommand, options.ExploringCommand):
                 camera.scene = hands.scene
                 lifts.append({"view": len(writer.steps)} | taken.to_json() | {"state": state})
                 if taken.body is not None and explorer.robot is not None:
-                    drawn = draw_lift(camera.scene, taken, graph, explorer.robot.T_world_camera, config)
-                    writer.files[lift_file(len(writer.steps))] = lift_picture(drawn)
+                    lift = draw_lift(camera.scene, taken, graph, explorer.robot.T_world_camera, config)
+                    writer.files[lift_file(len(writer.steps))] = lift
                 return taken.body is not None
 
             known = {"goal": self.goal, "hands": self.hands, "threads": cores(), "reachable": reachable}

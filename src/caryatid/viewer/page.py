@@ -32,9 +32,10 @@ from caryatid.sensing.view_sphere import direction
 from caryatid.support.relations import removal_of
 from caryatid.viewer.drawing import LAYERS, NEXT, SceneDrawing, reduced, step_of_scene, thinned
 from caryatid.viz.colours import SALIENCY_STOPS, object_colour, scale
-from caryatid.viz.drawings import draw_chart, draw_layers
+from caryatid.viz.drawings import draw_chart
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.notebook import cell_html
+from caryatid.viz.pictures import Picture, raster
 from caryatid.viz.report import Figure, Section
 from caryatid.viz.tables import census, noticed, object_table, support_table
 
@@ -324,7 +325,8 @@ def _describe_signs() -> str:
         "Grey cameras": "earlier views with their images; the newest is black and larger",
         "Filled camera": "next view: blue = chosen by the planner, pink = chosen by hand",
     }
-    picture = draw_layers("saliency", [scale(np.tile(np.linspace(-1.0, 1.0, 340), (10, 1)), SALIENCY_STOPS)])
+    bar = scale(np.tile(np.linspace(-1.0, 1.0, 340), (10, 1)), SALIENCY_STOPS)
+    picture = Picture("saliency", 340.0, 10.0, [raster(bar, 0.0, 0.0, 340.0, 10.0)])
     caption = "Saliency: from low (already seen) to high (look here); the maximum of each view is red."
     return cell_html(Section("Key", facts=[*signs.items()], figures=[Figure("", picture, caption)]))
 
