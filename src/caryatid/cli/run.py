@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import webbrowser
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from caryatid.io.mask_sources import MaskSource
     from caryatid.sources import Source
     from caryatid.steps import RunWriter
-    from caryatid.viewer.page import Page, PageProcess
+    from caryatid.viewer.page import Page
 
 PORT = 8770
 """Default port of the viewer; if taken, the next free one."""
@@ -50,7 +50,7 @@ class RunCommand(options.ComputingCommand):
         """Open the source; returns its name, its ground truth, and the steps of the run."""
         raise NotImplementedError
 
-    def run(self, config: Config, page: PageProcess | None = None) -> None:
+    def run(self, config: Config, page: Page | None = None) -> None:
         """Save all steps, write the report and print the result.
 
         Raises:
@@ -402,11 +402,11 @@ def _check_found(goal: str | None, last: Step) -> None:
 
 
 @contextmanager
-def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]:
+def _watched(name: str, config: Config, output: Output) -> Iterator[Page]:
     """Open a page for an exploration; after its end, keep the page open until Ctrl-C."""
-    from caryatid.viewer.page import PageProcess
+    from caryatid.viewer.page import Page
 
-    page = PageProcess(f"caryatid: {name}", config.support, port=PORT)
+    page = Page(f"caryatid: {name}", config.support, port=PORT)
     output.say(f"{name} at {page.url}")
     webbrowser.open(page.url)
     try:
@@ -449,18 +449,18 @@ def _about(command: RunCommand | Clear) -> dict[str, Any]:
 
 def _record(
     writer: RunWriter,
-    steps: Iterable[Step],
+    steps: Iterator[Step],
     truth: TrueScene | None,
     output: Output,
     heading: str,
-    page: PageProcess | None = None,
+    page: Page | None = None,
 ) -> Step:
     """Score, save, print and show every step; return the last."""
     from caryatid.evaluation.scores import score
 
     last = None
     writer.more["warnings"] = output.warnings
-    for step in steps:
+    for step in steps if page is None else page.in_turn(steps):
         scored = None if truth is None else score(step.graph, truth)
         writer.add(step, None if scored is None else asdict(scored))
         if last is None:
