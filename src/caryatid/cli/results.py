@@ -213,7 +213,7 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
     from caryatid.sessions.reading import open_run
     from caryatid.steps import read_config, read_steps
     from caryatid.viz.pdf import print_pdf
-    from caryatid.viz.report import make_report, read_lifts, render_html
+    from caryatid.viz.report import make_report, read_lift, render_html
 
     with open_run(folder) as run:
         config, record = read_config(run), run.record
@@ -227,7 +227,7 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
             about=" · ".join(filter(None, about)),
             settings=settings,
             scores=record.get("scores", ()),
-            strip=read_lifts(folder),
+            strip=[read_lift(path) for path in sorted((folder / "lifts").glob("*.png"))],
             warnings=record.get("warnings", ()),
             config=config.report,
         )

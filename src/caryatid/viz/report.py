@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from PIL import Image
@@ -378,15 +378,13 @@ def draw_lift(
     return content.getvalue()
 
 
-def read_lifts(folder: Path) -> list[Figure]:
-    """Read the pictures that `draw_lift` drew into a run folder, if any."""
-    figures = []
-    for path in sorted((folder / "lifts").glob("*.png")):
-        with Image.open(path) as image:
-            pixels, (width, height) = np.asarray(image.convert("RGB")), image.size
-            picture = Picture(f"lift {path.stem}", width, height, [raster(pixels, 0.0, 0.0, width, height)])
-            figures.append(Figure(image.info.get("heading", ""), picture, image.info.get("caption", ""), 3))
-    return figures
+def read_lift(file: Path | BinaryIO) -> Figure:
+    """Read a picture that `draw_lift` drew."""
+    with Image.open(file) as image:
+        (width, height), info = image.size, image.info
+        pixels = raster(np.asarray(image.convert("RGB")), 0.0, 0.0, width, height)
+    picture = Picture(f"lift of {info.get('heading', '')}", width, height, [pixels])
+    return Figure(info.get("heading", ""), picture, info.get("caption", ""), 3)
 
 
 # As HTML
