@@ -30,7 +30,6 @@ from caryatid.steps import read_run
 from caryatid.viewer.drawing import BY_HAND, EARLIER_POINTS, LAYERS, reduced
 from caryatid.viewer.loop import LoopPage, candidate_under
 from caryatid.viewer.page import Page, describe_object, describe_view
-from caryatid.viewer.robot import RobotDrawing, stations
 from caryatid.viz.colours import object_colour, rgb
 
 pytest.importorskip("viser")
@@ -244,24 +243,19 @@ def test_a_view_may_be_chosen_by_hand_and_another_fusion_and_planner(loop):
         loop.use_planner("nobody")
 
 
-def test_the_robot_drives_its_way_to_where_it_takes_the_view(loop, monkeypatch):
-    passed, drive = [], RobotDrawing.drive
-    monkeypatch.setattr(RobotDrawing, "drive", lambda robot: (drive(robot), passed.append(robot))[0])
+def test_the_robot_stands_where_it_took_the_view_and_its_way_leads_there(loop):
     loop.show_layer("robot", True)
     for _ in range(2):
         loop.turn()
-        loop.wait()
-    way, there = loop.steps[0].decision.waypoints, loop.steps[1].robot.posture
-    places = np.array(stations(way))
-    assert len(passed) >= len(places)
-    np.testing.assert_allclose(places[0][:3], way[0].platform_world)
-    assert np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1).max() < 0.051
-    (base,) = loop.drawing.nodes["robot"]
-    np.testing.assert_allclose(base.position[:2], there.platform_world[:2])
-    loop.go_to(0)
     loop.wait()
-    (base,) = loop.drawing.nodes["robot"]
-    np.testing.assert_allclose(base.position[:2], way[0].platform_world[:2])
+    base, links, way = loop.drawing.nodes["robot"]
+    there = loop.steps[1].robot
+    np.testing.assert_allclose(base.position[:2], there.posture.platform_world[:2])
+    np.testing.assert_allclose(links.points[-1, -1], there.T_world_camera[:3, 3], atol=1e-3)
+    ends = [loop.steps[0].robot.posture.platform_world, there.posture.platform_world]
+    np.testing.assert_allclose(
+        [way.points[0, 0, :2], way.points[-1, -1, :2]], [e[:2] for e in ends], atol=1e-3
+    )
 
 
 def test_earlier_views_keep_few_points_and_their_cameras_are_not_sent_again(step, settings):

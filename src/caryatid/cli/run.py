@@ -406,6 +406,7 @@ def _watched(name: str, config: Config, output: Output) -> Iterator[Page]:
     """Open a page for an exploration; after its end, keep the page open until Ctrl-C."""
     from caryatid.viewer.page import Page
 
+    sys.setswitchinterval(0.0005)  # As in `view`.
     page = Page(f"caryatid: {name}", config.support, port=PORT)
     output.say(f"{name} at {page.url}")
     webbrowser.open(page.url)

@@ -17,7 +17,6 @@ from caryatid.planning.decision import Decision
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Cloud, View
-from caryatid.viewer.robot import RobotDrawing
 from caryatid.viz.colours import SALIENCY_STOPS, Colour, label_colours, object_colour, rgb, scale
 from caryatid.viz.drawings import image_of
 from caryatid.viz.scene_3d import support_ends
@@ -41,6 +40,7 @@ OPACITY, FAINT = 0.55, 0.2
 CLEAR = 0.012
 """Between the end of an arrow and the centre of its object, where its name is [m]."""
 SCREEN: dict[str, Any] = {"thickness": 1.6, "thickness_units": "screen"}
+MATT: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 
 
 def reduced(step: Step) -> Step:
@@ -90,7 +90,6 @@ class SceneDrawing:
 
     Attributes:
         nodes: What the browser shows, by layer, or layer and camera.
-        robot: The robot, once it is shown.
     """
 
     def __init__(self, server: Any, clicked: Callable[[str], None]) -> None:
@@ -99,8 +98,6 @@ class SceneDrawing:
         for name, shown in LAYERS.items():
             self._frames[name].visible = shown
         self._shown: dict[str, tuple[object, ...]] = {}
-        self._shown_robot: RobotPose | None = None
-        self.robot: RobotDrawing | None = None
         self.nodes: dict[str, list[Any]] = {name: [] for name in LAYERS}
 
     def show_layer(self, name: str, visible: bool) -> None:
@@ -116,14 +113,9 @@ class SceneDrawing:
         point_size: float = 0.003,
         true_colours: bool = False,
     ) -> None:
-        """Show a step in place of the one before.
+        """Show a step, with the cameras of all steps so far, in place of the one before.
 
-        Args:
-            step: What is known.
-            steps: The steps so far, the newest last.
-            chosen: Id of the object that stands out.
-            point_size: Diameter of the cloud's points [m].
-            true_colours: Points as the camera saw them, not in their objects' colours.
+        An object may stand out; points have a diameter [m], and their objects' colours or their own.
         """
         decision = step.decision
         layers: dict[str, tuple[object, ...]] = {
@@ -194,8 +186,7 @@ class SceneDrawing:
             if name in known:
                 nodes.append(_changed(known[name], look))
             else:
-                still = {"side": "double", "cast_shadow": False, "receive_shadow": False}
-                nodes.append(self._scene.add_mesh_simple(name, **look, **still))
+                nodes.append(self._scene.add_mesh_simple(name, side="double", **look, **MATT))
                 nodes[-1].on_click(lambda _, name=item.id: self._clicked(name))
             edges = f"{name}/edges"
             if edges in known and len(ends):
@@ -270,9 +261,7 @@ class SceneDrawing:
         colours = scale(np.array([p.saliency for p in points]), SALIENCY_STOPS)
         ends = sphere.centre_world + sphere.radius * np.array([p.direction for p in points])
         both = np.repeat(colours[:, None], 2, axis=1)
-        rays = self._lines(
-            "/interest/rays", np.stack([at, ends], axis=1), both, **(SCREEN | {"thickness": 1.0})
-        )
+        rays = self._lines("/interest/rays", np.stack([at, ends], axis=1), both, **SCREEN)
         return [self._points("/interest/points", at, colours, 0.02), *rays]
 
     def _cameras(self, name: str, view: View | None, following: Decision | None, colour: Colour) -> list[Any]:
@@ -286,17 +275,24 @@ class SceneDrawing:
         if view is None or T_world_camera is None:
             return []
         height, width = view.depth.shape
-        look |= _pose(T_world_camera) | SCREEN | {"cast_shadow": False, "receive_shadow": False}
+        look |= _pose(T_world_camera) | SCREEN | MATT
         angle, shape = 2.0 * float(np.arctan2(height / 2.0, view.K[1, 1])), width / height
         frustum = self._scene.add_camera_frustum(f"/cameras/{name}", angle, shape, color=colour, **look)
         return [frustum, self._label(f"/cameras/name {name}", name, T_world_camera[:3, 3] + [0.0, 0.0, 0.06])]
 
     def _robot(self, robot: RobotPose | None, before: Step | None) -> list[Any]:
-        """The robot; it drives there if it was shown at the view before."""
-        came = before is not None and before.robot is not None and before.robot is self._shown_robot
-        way = before.decision.waypoints if came and before is not None and before.decision else ()
-        self._shown_robot, self.robot = robot, RobotDrawing(self._scene, robot, way)
-        return self.robot.nodes
+        """The robot's base with links to its camera, and the way it came."""
+        if robot is None:
+            return []
+        (x, y, _), eye = robot.posture.platform_world, robot.T_world_camera[:3, 3]
+        foot = np.array([x, y, eye[2] - robot.posture.camera_height])
+        elbow = (foot + eye) / 2.0 + (0.0, 0.0, 0.25) if robot.arm else np.array([x, y, eye[2]])
+        radius, place = 0.08 if robot.arm else robot.footprint, foot + (0.0, 0.0, 0.1)
+        nodes = [self._scene.add_cylinder("/robot/base", radius, 0.2, SURE, position=place, **MATT)]
+        nodes += self._lines("/robot/links", np.array([[foot, elbow], [elbow, eye]]), EARLIER, thickness=0.1)
+        stops = () if before is None or before.decision is None else before.decision.waypoints
+        way = np.array([[*stop.platform_world[:2], foot[2]] for stop in stops]).reshape(-1, 3)
+        return nodes + self._lines("/robot/way", np.stack([way[:-1], way[1:]], axis=1), SURE, **SCREEN)
 
 
 def _changed(node: Any, look: dict[str, Any]) -> Any:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from html import escape
 from threading import RLock
@@ -77,7 +76,6 @@ class Page:
         self._charted: list[float | None] = []
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
-        self._driving: Future[None] | None = None
         self._build()
 
     def say(self, text: str) -> None:
@@ -139,23 +137,16 @@ class Page:
 
     def redraw(self) -> None:
         """Schedule drawing, unless it is already scheduled."""
-        self._pending = self._soon(self._pending, self._draw)
-
-    def _soon(self, pending: Future[None] | None, work: Callable[[], None]) -> Future[None] | None:
-        """Schedule work on the drawing thread, unless it is already scheduled."""
-        if pending is None or pending.running() or pending.done():
+        if self._pending is None or self._pending.running() or self._pending.done():
             with contextlib.suppress(RuntimeError):  # The page is being closed.
-                pending = self._drawer.submit(work)
-                pending.add_done_callback(_log_failure)
-        return pending
+                self._pending = self._drawer.submit(self._draw)
+                self._pending.add_done_callback(_log_failure)
 
     def wait(self) -> None:
         """Wait until everything is drawn, and raise drawing errors."""
         self._drawer.submit(lambda: None).result()
         if self._pending is not None:
             self._pending.result()
-        while (driving := self._driving) is not None and not driving.done():
-            self._drawer.submit(lambda: None).result()
 
     def close(self) -> None:
         """Stop serving the page."""
@@ -215,12 +206,6 @@ class Page:
         camera.fov = 0.72  # Narrow, so that near objects do not hide far ones [rad].
         camera.position = centre + 3.2 * reach * direction(azimuth, 0.55)  # From 3.2 radii, all objects fit.
 
-    def _drive(self) -> None:
-        """Move the robot along its path, and schedule the next move until it arrives."""
-        if self.drawing.robot is not None and self.drawing.robot.drive():
-            time.sleep(0.03)
-            self._driving = self._soon(self._driving, self._drive)
-
     def _draw(self) -> None:
         steps, scores, chosen = self.steps[: self._shown + 1], [*self.scores], self._chosen
         if not steps:
@@ -256,7 +241,6 @@ class Page:
             self._slider.value = self._shown + 1
             for panel, text in texts:
                 panel.content = text
-        self._driving = self._soon(self._driving, self._drive)
 
 
 def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
