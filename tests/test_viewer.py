@@ -27,8 +27,8 @@ from caryatid.graph import Support, SupportGraph
 from caryatid.io.graph_json import graph_text
 from caryatid.sources import open_source
 from caryatid.steps import read_run
-from caryatid.viewer.drawing import BY_HAND, EARLIER_POINTS, LAYERS, reduced
-from caryatid.viewer.loop import LoopPage, candidate_under
+from caryatid.viewer.drawing import BY_HAND, EARLIER_POINTS, LAYERS
+from caryatid.viewer.loop import LoopPage
 from caryatid.viewer.page import Page, describe_object, describe_view
 from caryatid.viz.colours import object_colour, rgb
 
@@ -99,12 +99,6 @@ def test_shapes_and_points_have_their_objects_colours_and_places(step, drawn):
     np.testing.assert_array_equal(drawn(step, true_colours=True)["/cloud/points"].colors, cloud.rgb)
 
 
-def test_only_layers_that_changed_are_sent_again(step, drawn):
-    first = drawn(step)
-    again = drawn(step, point_size=0.01)
-    assert [name for name in first if first[name] is not again[name]] == ["/cloud/points"]
-
-
 def test_a_shape_moves_as_a_whole_and_is_not_replaced(step, drawn):
     graph, before = step.graph, drawn(step)
     T = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, 0.3)), (0.1, 0.0, 0.2))
@@ -167,16 +161,6 @@ def test_the_sphere_is_painted_and_cameras_show_what_they_saw(step, drawn):
     by_hand = replace(step, decision=decision)
     planned = tuple(nodes["/cameras/next"].color)
     assert planned != tuple(drawn(by_hand)["/cameras/next"].color) == BY_HAND
-
-
-def test_what_is_kept_of_a_step_is_small(step):
-    large = replace(
-        step.view, depth=np.tile(step.view.depth, (8, 8)), rgb=None, labels=None, normals_camera=None
-    )
-    kept = reduced(replace(step, view=large)).view
-    assert kept.depth.shape[1] < 480
-    field_of_view = [view.depth.shape[1] / view.K[0, 0] for view in (kept, large)]
-    assert field_of_view[0] == pytest.approx(field_of_view[1], 0.02)
 
 
 def test_the_panel_describes_an_object(step, settings):
@@ -280,17 +264,6 @@ def test_a_recording_ends_with_its_views(recording, settings):
     assert "no candidate views left" in [page.turn() for _ in range(4)][-1]
     page.close()
     assert [step.robot for step in page.steps] == [None] * 3
-
-
-def test_a_ray_points_at_the_view_it_first_meets(step):
-    sphere, candidates = step.sphere, step.candidates
-    wanted, centre = candidates.directions[7], sphere.centre_world
-    outside = centre + 3.0 * sphere.radius * wanted
-    for origin, direction in ((outside, -wanted), (centre, wanted)):
-        found = candidate_under(origin, direction, sphere, candidates, 0.1)
-        assert candidates.directions[found] @ wanted > np.cos(0.02)
-    for origin, direction in ((outside, wanted), (centre, np.array([0.0, 0.0, -1.0]))):
-        assert candidate_under(origin, direction, sphere, candidates, 0.1) is None
 
 
 @pytest.mark.parametrize("simulated", [True, False])
