@@ -23,7 +23,7 @@ from caryatid.viewer.page import Page
 
 POINTS = 300_000
 """Number of points of the cloud that is shown."""
-SHOWN, COST, GROWTH = 150.0, 2.0, 1.0
+SHOWN, COST, GROWTH = 150.0, 10.0, 1.0
 """Targets: time until a view is shown [ms], share of the loop's CPU time [%], memory per view [MB]."""
 
 
