@@ -6,10 +6,10 @@ viser cannot restrict access. It listens on this machine alone, at a loopback ad
 from __future__ import annotations
 
 import asyncio
-import io
 import secrets
 import socket
-from contextlib import redirect_stdout, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any
@@ -53,7 +53,7 @@ class Door:
                 return None
 
         listening, token, hidden = _listen(host, port), secrets.token_urlsafe(16), _hidden_address()
-        with redirect_stdout(io.StringIO()):  # viser prints its address.
+        with _silent():
             self.server: Any = Server(host=hidden, port=0, label=title, verbose=False)
         pages = Path(viser.__file__).parent / "client" / "build"
         app = _app(f"ws://{hidden}:{self.server.get_port()}", pages, token, host)
@@ -67,8 +67,8 @@ class Door:
     def close(self) -> None:
         """Stop serving the page."""
         self._front.should_exit = self._front.force_exit = True
-        self._thread.join()
-        with redirect_stdout(io.StringIO()):
+        self._thread.join(5.0)
+        with _silent():
             self.server.stop()
 
 
@@ -148,3 +148,16 @@ def _is_ours(headers: Headers, host: str) -> bool:
     known = name in {"127.0.0.1", "localhost", "::1", host} or (name and host in ("0.0.0.0", "::", ""))
     ours = all(origin in (f"http://{named}", f"https://{named}") for origin in headers.getlist("Origin"))
     return bool(known and ours)
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep viser from printing."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before

@@ -289,6 +289,7 @@ def _describe_signs() -> str:
         "Coloured dots on the sphere": "candidate views that the robot can reach, coloured by saliency",
         "Fine grey dots": "views out of reach",
         "Balls with rays": "points of interest, and the views that show them best",
+        "Grey robot": "where it stands, and as a line on the floor, the way it came",
         "Grey cameras": "earlier views with their images; the newest is black and larger",
         "Filled camera": "next view: blue = chosen by the planner, pink = chosen by hand",
     }
