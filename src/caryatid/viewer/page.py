@@ -72,8 +72,6 @@ class Page:
         self._support, self._small = support or SupportConfig(), small
         self._shown, self._chosen = -1, ""
         self._staged: Step | None = None
-        self._graph_drawn: SupportGraph | tuple[str, ...] | None = None
-        self._charted: list[float | None] = []
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
         self._build()
@@ -216,17 +214,12 @@ class Page:
         count, graph = len(self.steps), step.graph
         before = steps[-2] if len(steps) > 1 else None
         texts = [(self._summary, describe_view(step, f1, count, before))]
-        # While an object is lifted, only the places of the vertices change.
-        drawn = graph if self._staged is None else tuple(o.id for o in graph.objects)
-        if drawn != self._graph_drawn:
-            self._graph_drawn = drawn
-            picture = draw_graph(graph, compact=True)
-            texts.append((self._graph, cell_html(Section("", figures=[Figure("", picture)]))))
-        if scores != self._charted and any(f1 is not None for f1 in scores):
-            self._charted = scores
+        drawn = Figure("", draw_graph(graph, compact=True))
+        texts.append((self._graph, cell_html(Section("", figures=[drawn]))))
+        if any(f1 is not None for f1 in scores):
             known = [np.nan if f1 is None else f1 for f1 in scores]
-            chart = draw_chart("F1 after each view", "F1", {"F1": known}, top=1.0)
-            texts.append((self._chart, cell_html(Section("", figures=[Figure("", chart)]))))
+            chart = Figure("", draw_chart("F1 after each view", "F1", {"F1": known}, top=1.0))
+            texts.append((self._chart, cell_html(Section("", figures=[chart]))))
         if chosen:
             with self.working:
                 gone = {each.lift.object_id for each in steps if each.lift is not None}

@@ -218,21 +218,14 @@ def _answer(
     picture, caption = draw_graph(graph, truth.get("wrong", ()), truth.get("missing", ())), SUPPORTS
     if truth.get("wrong") or truth.get("missing"):
         caption += " Red: wrong or missing, compared with the ground truth."
-    wide = picture.width > WIDE
+    wide, azimuth = picture.width > WIDE, _first_azimuth(step)
     supports = Figure("Support graph", picture, caption, share=1 if wide else 2)
-    azimuth = _first_azimuth(step)
-    solid = draw_cloud(step.cloud, graph, azimuth)
-    still = "All points, with the fitted shapes."
+    solid, still = draw_cloud(step.cloud, graph, azimuth), "All points, with the fitted shapes."
     seen = Figure("Fused cloud", solid, still)
     if shown.view is not None:
         caption = f"View {shown.index + 1} with the final shapes; objects with pale names are not visible."
         seen = Figure("The objects", draw_image(shown.view, shown.labels, graph, width), caption)
-    figures = [supports, seen] if wide else [seen, supports]
-    if graph.objects:
-        caption = "Drag to rotate, scroll to zoom. Arrows are visible through objects; orange: doubtful."
-        heading, share, page = "In 3D" if wide else "", 2 if wide else 1, scene_3d_html(graph, azimuth)
-        figures.append(Figure(heading, solid, still, share, page=page, page_caption=caption))
-    yield Section("Answer", text, figures if wide else figures[:2], facts)
+    yield Section("Answer", text, [supports, seen] if wide else [seen, supports], facts)
     doubtful = doubts(graph)
     text = f"Nothing: all supports and objects have a probability above {DOUBTFUL}, and all shapes fit."
     if any(s.probability is None for s in graph.supports):
@@ -240,8 +233,11 @@ def _answer(
     elif doubtful:
         text = ""
     yield Section("What is doubtful", text, facts=doubtful)
-    if figures[2:] and not wide:
-        yield Section("In 3D", figures=figures[2:])
+    if graph.objects:
+        caption = "Drag to rotate, scroll to zoom. Arrows are visible through objects; orange: doubtful."
+        page = scene_3d_html(graph, azimuth)
+        figure = Figure("", solid, still, share=1, page=page, page_caption=caption)
+        yield Section("In 3D", figures=[figure])
 
 
 def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list[Figure]:
