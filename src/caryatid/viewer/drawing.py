@@ -47,14 +47,12 @@ def reduced(step: Step) -> Step:
     """The step reduced to what is drawn of it, so that the page can keep every step."""
     view, cloud, candidates, decision = step.view, step.cloud, step.candidates, step.decision
     if view is not None:
-        k = max(1, view.depth.shape[1] // 240)
-        rgb = None if view.rgb is None else view.rgb[::k, ::k].copy()
-        K = np.diag([1.0 / k, 1.0 / k, 1.0]) @ view.K
-        view = View(view.depth[::k, ::k].copy(), K, view.T_world_camera, rgb, name=view.name)
+        view = replace(view, labels=None, normals_camera=None, ignored=None)
+        view = view.every(max(1, view.depth.shape[1] // 240))
     points: Any = cloud.points_world.astype(np.float32)
     cloud = replace(cloud, points_world=points, normals_world=np.zeros(points.shape, np.int8))
-    sphere = replace(step.sphere, directions=step.sphere.directions[step.sphere.directions[:, 2] > 0.0])
-    sphere = replace(sphere, directions=sphere.directions[:: max(1, len(sphere.directions) // 900)])
+    upper = step.sphere.directions[step.sphere.directions[:, 2] > 0.0]
+    sphere = replace(step.sphere, directions=upper[:: max(1, len(upper) // 900)])
     if candidates is not None:
         none = candidates.T_world_camera[:0]
         candidates = replace(candidates, T_world_camera=none, path_length=none[:, 0, 0], indices=None)

@@ -415,12 +415,10 @@ def draw_chart(
     for number in range(1, count + 1, -(-count // 10)):
         parts.append(text(places(number, 0.0)[0, 0], 184.0, str(number), 11.0, SOFT))
     for k, (name, values) in reversed([*enumerate(lines.items())]):
-        colour, sides = colours.PALETTE[k], (24, 4, 4, 3)[k]
-        angle = 2.0 * np.pi * (np.arange(sides) / sides + (0.0, 0.125, 0.0, 0.25)[k])
-        mark = (3.0 + k) * np.stack([np.cos(angle), -np.sin(angle)], axis=-1)
         at, sample = places(np.arange(1, len(values) + 1), values), np.array([20.0 + 116.0 * k, 226.0])
         for course, marked in ((at, at), (sample + [(-14.0, 0.0), (14.0, 0.0)], [sample])):
-            parts.append(line(course, colour, 2.0, stroke_dasharray=("none", "8 4", "2 4", "8 3 2 3")[k]))
-            parts += [area(place + mark, colour) for place in marked if np.isfinite(place).all()]
+            dashes = ("none", "8 4", "2 4", "8 3 2 3")[k]
+            parts.append(line(course, colours.PALETTE[k], 2.0, stroke_dasharray=dashes))
+            parts += [dot(p, 3.0 + k, colours.PALETTE[k]) for p in marked if np.isfinite(p).all()]
         parts.append(text(sample[0] + 20.0, sample[1], name, 11.0, SOFT, text_anchor="start"))
     return Picture(title, width, height, parts)
