@@ -50,9 +50,9 @@ class Tab:
                 return
         route.continue_()
 
-    def open(self, url: str) -> None:
+    def open(self, url: str, resolution: float = 0.5) -> None:
         """Go to a viewer's page, at half resolution since it is drawn in software, and wait for its scene."""
-        self.page.goto(f"{url}?fixedDpr=0.5")
+        self.page.goto(f"{url}?fixedDpr={resolution}")
         self.page.wait_for_selector("canvas")
         self.wait_for_node("/shapes/o1")
         self.page.locator("#webgl-software-rendering button").click()

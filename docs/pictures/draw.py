@@ -232,7 +232,7 @@ def viewer(browser: Any) -> Iterator[tuple[str, Image.Image]]:
             tab.press("next view")
             tab.wait_for_text(f"View {number} of {number}")
         yield "views", shot(tab)
-        tab.click(page, page.steps[-1].graph["o6"].centre_world)
+        page.describe("o6")
         tab.wait_for_text("Without o6")
         yield "object", shot(tab)
         tab.press("clear")
