@@ -243,9 +243,12 @@ def test_without_chromium_one_sentence_says_what_to_install(monkeypatch, tmp_pat
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(InputError, match="install Chromium"):
         print_pdf("<p></p>")
-    monkeypatch.setenv("CHROMIUM", str(tmp_path / "nothing"))
-    with pytest.raises(InputError, match="from a browser"):
-        print_pdf("<p></p>")
+    for program, said in (("nothing", "No such file"), ("broken", "no display")):
+        (tmp_path / "broken").write_text("#!/bin/sh\necho no display >&2\nexit 3\n")
+        (tmp_path / "broken").chmod(0o755)
+        monkeypatch.setenv("CHROMIUM", str(tmp_path / program))
+        with pytest.raises(InputError, match=f"{said}.*; print .* from a browser"):
+            print_pdf("<p></p>")
 
 
 def test_charts_need_several_views_or_scores_and_changes_are_listed(make_step):
