@@ -15,6 +15,7 @@ $(VENV)/.usable: pyproject.toml constraints.txt
 
 $(VENV)/.installed: $(VENV)/.usable
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	$(BIN)/python -m caryatid.simulation.warm_up
 	touch $@
 
 demo: $(VENV)/.usable
@@ -41,6 +42,7 @@ check: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tools/caps.py
 
 notebooks: install
 	$(BIN)/python docs/notebooks/execute.py

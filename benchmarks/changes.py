@@ -19,14 +19,11 @@ from measures import OnScenes, print_table, run_main
 from rich.console import Console
 
 from caryatid.benchmark.episodes import open_scene
-from caryatid.config import SegmentationMethod
 from caryatid.config.settings import read_settings
 from caryatid.evaluation.scores import TrueScene, score
 from caryatid.evaluation.truths import true_scene_from_simulation
-from caryatid.exploration import Explorer
 from caryatid.geometry.transforms import Array
 from caryatid.simulation.lifting import ASIDE, Lifting
-from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import GroundTruth, ground_truth
 from caryatid.simulation.world import SimulatedScene, bounds, posed, poses_of, strayed
 
@@ -45,8 +42,6 @@ class Args(OnScenes):
     """Names of built-in scenes, or scene folders."""
     kinds: tuple[str, ...] = KINDS
     """Kinds of change: any of `removed`, `moved`, `added` and `nothing`."""
-    segmentation: SegmentationMethod = "labels"
-    """Where segments come from."""
 
 
 def measure(task: tuple[str, str, Args]) -> dict[str, Any] | None:
@@ -61,14 +56,12 @@ def measure(task: tuple[str, str, Args]) -> dict[str, Any] | None:
             return None
         begin, end = changed
     config = read_settings(None, (f"active.max_views={UNCHANGED}", *args.set))
-    simulation = make_simulation(scene, config, noise=args.noise, seed=args.seed)
-    known: dict[str, Any] = {"segmentation": args.segmentation, "seed": args.seed, "config": config}
-    explorer = Explorer(simulation.camera, simulation.robot, **known)
-    simulation.camera.scene = posed(scene, begin)
+    camera, explorer = args.start(scene, config)
+    camera.scene = posed(scene, begin)
     told: list[str] = []
     for number in range(UNCHANGED if kind == "nothing" else BEFORE + AFTER):
         if number == BEFORE:
-            simulation.camera.scene = posed(scene, end)
+            camera.scene = posed(scene, end)
         if number > 0:
             explorer.plan()
             explorer.go()
@@ -76,7 +69,7 @@ def measure(task: tuple[str, str, Args]) -> dict[str, Any] | None:
         told += [f"{c.kind} {c.object_id} in view {number + 1}: {c.why}" for c in step.changes]
         if number < BEFORE or kind == "nothing":
             false = len(told)
-    found = score(step.graph, truth_of(simulation.camera.scene))
+    found = score(step.graph, truth_of(camera.scene))
     noticed = kind == "nothing" or any(t.startswith(kind) for t in told[false:])
     other = sum(not t.startswith(kind) for t in told[false:])
     row = {"scene": name, "kind": kind, "noticed": float(noticed), "f1": found.f1, "false": false}

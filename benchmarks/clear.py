@@ -37,9 +37,8 @@ from rich.console import Console
 
 from caryatid.benchmark.episodes import open_scene
 from caryatid.benchmark.suites import DENSE, HEAPED
-from caryatid.config import Config, GripperConfig, SegmentationMethod
+from caryatid.config import Config, GripperConfig
 from caryatid.config.settings import read_settings
-from caryatid.exploration import Explorer
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Grasp, TakeStep
 from caryatid.manipulation.clearing import clear
@@ -47,7 +46,6 @@ from caryatid.manipulation.dismantling import SimulatedHands, Taken
 from caryatid.manipulation.grasps import gripper_boxes
 from caryatid.manipulation.order import plan_order
 from caryatid.simulation.lifting import Lifting
-from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.world import SimulatedScene, poses_of, quaternion
 
 
@@ -63,8 +61,6 @@ class Args(OnScenes):
     """Number of objects to reach in each scene, one by one; 0 clears the whole scene."""
     order: int = 0
     """Number of views after which a whole order is planned and carried out; 0 looks again after each lift."""
-    segmentation: SegmentationMethod = "labels"
-    """Where segments come from."""
 
 
 def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
@@ -80,9 +76,7 @@ def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
 def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> dict[str, Any]:
     """Clear a scene, or reach the body with the goal's label."""
     config = read_settings(None, args.set)
-    simulation = make_simulation(scene, config, noise=args.noise, seed=args.seed)
-    known: dict[str, Any] = {"segmentation": args.segmentation, "seed": args.seed, "config": config}
-    explorer = Explorer(simulation.camera, simulation.robot, **known)
+    camera, explorer = args.start(scene, config)
     hands, done = SimulatedHands(scene, config), list[Taken]()
     grasps = list[tuple[list[str], bool]]()
 
@@ -91,7 +85,7 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
         if step.grasp is not None and body in hands.left:
             grasps.append(grasped(scene, before, step.grasp, body, config.gripper))
         done.append(hands.take(step, hands.bodies(explorer.scene.graph)))
-        simulation.camera.scene = hands.scene
+        camera.scene = hands.scene
         return done[-1].body is not None
 
     wanted = None if goal is None else f"o{goal}"

@@ -60,8 +60,8 @@ def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
 
     def explored(goal: str | None) -> tuple[int, SupportGraph]:
         simulation = make_simulation(scene, config, noise=args.noise, seed=args.seed)
-        known: dict[str, Any] = {"planner": args.planner, "segmentation": "labels", "seed": args.seed}
-        known |= {"config": config, "goal": goal, "until": args.until if goal else None}
+        known: dict[str, Any] = {"config": config, "seed": args.seed, "segmentation": args.segmentation}
+        known |= {"planner": args.planner, "goal": goal, "until": args.until if goal else None}
         *_, last = explore(simulation.camera, simulation.robot, **known)
         return last.index + 1, last.graph
 

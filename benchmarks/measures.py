@@ -18,8 +18,11 @@ import tyro
 from rich.console import Console
 
 from caryatid.benchmark.episodes import family
-from caryatid.config import NoiseModel
+from caryatid.config import Config, NoiseModel, SegmentationMethod
 from caryatid.errors import CaryatidError
+from caryatid.exploration import Explorer
+from caryatid.simulation.setup import make_simulation
+from caryatid.simulation.world import SimulatedScene
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -64,17 +67,31 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class OnScenes(Spread):
-    """Options of a benchmark that explores simulated scenes."""
+class Simulated(Spread):
+    """Options of a benchmark on simulated views."""
 
-    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Names of built-in scenes, or scene folders."""
     noise: NoiseModel = "carmine"
     """Noise of the simulated camera."""
     seed: int = 0
     """Seed of the noise and of the choice of objects."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Settings, e.g. `--set active.effort=0.1`."""
+
+
+@dataclass(frozen=True)
+class OnScenes(Simulated):
+    """Options of a benchmark that explores simulated scenes."""
+
+    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Names of built-in scenes, or scene folders."""
+    segmentation: SegmentationMethod = "labels"
+    """Where segments come from."""
+
+    def start(self, scene: SimulatedScene, config: Config, **known: Any) -> tuple[Any, Explorer]:
+        """Return the simulated camera in a scene, and an exploration with it."""
+        simulation = make_simulation(scene, config, noise=self.noise, seed=self.seed)
+        known |= {"segmentation": self.segmentation, "seed": self.seed, "config": config}
+        return simulation.camera, Explorer(simulation.camera, simulation.robot, **known)
 
     def drawn(self, name: str, labels: Sequence[int], goals: int) -> list[int]:
         """Draw the labels of the goals in a scene."""

@@ -20,12 +20,12 @@ import numpy as np
 import pandas as pd
 import tyro
 from accuracy import EASY
-from measures import Gated, Measure, print_table, run_main
+from measures import Gated, Measure, Simulated, print_table, run_main
 from numpy.typing import NDArray
 from rich.console import Console
 
 from caryatid.benchmark.episodes import family
-from caryatid.config import Config, NoiseModel
+from caryatid.config import Config
 from caryatid.config.settings import read_settings
 from caryatid.errors import CaryatidError
 from caryatid.evaluation.oracle import spread_out
@@ -50,19 +50,13 @@ SHARE = 0.2
 
 
 @dataclass(frozen=True)
-class Args(Gated):
+class Args(Gated, Simulated):
     """Segment views, and compare the segments with true masks."""
 
     sources: Annotated[tuple[str, ...], tyro.conf.Positional] = BUILT_IN
     """Scene folders, names of built-in scenes, or BOP folders."""
     views: int = 4
     """Number of views of each scene; a recording has its own."""
-    noise: NoiseModel = "carmine"
-    """Noise of the simulated camera."""
-    seed: int = 0
-    """Seed of the noise."""
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Settings, e.g. `--set segmentation.concavity=12`."""
 
 
 def views_of(source: str, args: Args, config: Config) -> Iterator[View]:

@@ -401,8 +401,8 @@ def measure_start(effort: Effort) -> list[Row]:
         for name, what, took, target in (
             ("import", "import caryatid", importing, 0.5),
             ("help", "caryatid --help", helping[1:], 0.4),
-            ("first", f"first use, nothing compiled: {views}", [cold], 20.0),
-            ("compile", "of it, compiling", [cold - median(warm)[0]], 20.0),
+            ("first", f"first use, nothing compiled: {views}", [cold], 30.0),
+            ("compile", "of it, compiling", [cold - median(warm)[0]], 30.0),
             ("again", "the same in a new process, compiled", warm, None),
         )
     ]

@@ -32,7 +32,6 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "formulas",
     "reference",
@@ -41,12 +40,13 @@ exclude_patterns = ["_build", "gallery/*.ipynb", "gallery/*.py", "notebooks/*.py
 suppress_warnings = ["config.cache"]
 default_role = "code"
 
-myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 nb_execution_mode = "off"  # the committed notebooks contain their outputs
 nb_merge_streams = True
 html_math_renderer = "drawn"
 
+autodoc_default_options = {"members": True}
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_typehints_format = "short"
@@ -129,7 +129,14 @@ def leave_settings_out(
     return ("", None) if what == "class" and name.startswith("caryatid.config.") else (arguments, gives)
 
 
+def head_modules(app: object, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
+    """Put the name of a module as a heading above its docstring."""
+    if what == "module":
+        lines[:0] = [name, "=" * len(name), ""]
+
+
 def setup(app: object) -> None:
     """Register the handlers with Sphinx."""
     app.connect("autodoc-process-signature", leave_settings_out)  # type: ignore[attr-defined]
+    app.connect("autodoc-process-docstring", head_modules)  # type: ignore[attr-defined]
     app.connect("source-read", adapt)  # type: ignore[attr-defined]

@@ -26,7 +26,6 @@ from caryatid.exploration import Step
 from caryatid.geometry import transforms
 from caryatid.io import write_recording
 from caryatid.io.images import png
-from caryatid.runtime.compiling import compile_kernels
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Cloud
 from caryatid.simulation.camera import SimulatedCamera
@@ -135,12 +134,6 @@ def run_command(*arguments: object) -> int:
         return cli.main([str(a) for a in arguments])
     except SystemExit as stop:
         return int(stop.code or 0)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def compiled() -> None:
-    """What commands say in a test is not that they compile kernels."""
-    compile_kernels()
 
 
 @pytest.fixture(scope="session")

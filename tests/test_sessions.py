@@ -329,7 +329,7 @@ def test_without_a_usable_snapshot_no_view_is_lost(begun, views, tmp_path, monke
 
 @pytest.mark.parametrize(
     "kind",
-    ["io.staging StagedFolder", "config.settings Path", "scene compile_kernels", "graph Support.doubtful"],
+    ["io.staging StagedFolder", "config.settings Path", "scene one_blas_thread", "graph Support.doubtful"],
 )
 def test_a_snapshot_restores_only_types_of_a_scene(kind):
     payload = b"\x80\x04ccaryatid." + kind.replace(" ", "\n").encode() + b"\n."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -13,8 +12,10 @@ import tempfile
 import time
 from pathlib import Path
 
+import tyro
+
 ROOT = Path(__file__).parents[1]
-VERSIONS = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text())
+VERSIONS = tuple(re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text()))
 """Python versions in the classifiers."""
 
 
@@ -58,27 +59,23 @@ def run(*words: str, cwd: Path | None = None) -> str:
     return done.stdout
 
 
-def main() -> None:
-    """Build, install and try; print one line per Python and distribution."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder for wheel and sdist")
-    parser.add_argument("--python", nargs="*", default=VERSIONS, help="try only these versions, e.g. 3.12")
-    options = parser.parse_args()
-    shutil.rmtree(options.out, ignore_errors=True)
-    run(sys.executable, "-m", "build", "--outdir", str(options.out), str(ROOT))
-    (wheel,), (sdist,) = options.out.glob("*.whl"), options.out.glob("*.tar.gz")
+def main(out: Path = ROOT / "dist", python: tuple[str, ...] = VERSIONS) -> None:
+    """Build into a folder, install and try in these Pythons; print one line per Python and distribution."""
+    shutil.rmtree(out, ignore_errors=True)
+    run(sys.executable, "-m", "build", "--outdir", str(out), str(ROOT))
+    (wheel,), (sdist,) = out.glob("*.whl"), out.glob("*.tar.gz")
     run(sys.executable, "-m", "twine", "check", "--strict", str(wheel), str(sdist))
     for file in (wheel, sdist):
         print(f"{file.name}: {file.stat().st_size / 1e6:.2f} MB", flush=True)
-    pythons = {wanted: find_python(wanted) for wanted in options.python}
+    pythons = {wanted: find_python(wanted) for wanted in python}
     distributions = [wheel, sdist]
-    for wanted, python in pythons.items():
-        if python is None:
+    for wanted, found in pythons.items():
+        if found is None:
             print(f"Python {wanted}: not installed, skipped", flush=True)
             continue
         for distribution in distributions:
             with tempfile.TemporaryDirectory(prefix="caryatid-") as folder:
-                told = try_out(python, distribution, Path(folder))
+                told = try_out(found, distribution, Path(folder))
             print(f"Python {wanted}, {distribution.suffix.lstrip('.')}: {json.dumps(told)}", flush=True)
         distributions = [wheel]
     if not any(pythons.values()):
@@ -86,4 +83,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

@@ -26,9 +26,11 @@ from scipy.spatial.transform import Rotation
 
 from caryatid.config import SensorConfig
 from caryatid.geometry import transforms
+from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 from caryatid.segmentation.affinities import MODEL, OFFSETS, features
 from caryatid.sensing.view_sphere import direction
+from caryatid.simulation import generation
 from caryatid.simulation.camera import depth_edges, intrinsics, pixel_rays
 from caryatid.simulation.world import quaternion
 
@@ -70,12 +72,6 @@ def turned(rings: Sequence[tuple[float, float]], corners: int = 14) -> list[Part
     return [hull(np.concatenate([ring(*a, corners), ring(*b, corners)])) for a, b in pairwise(rings)]
 
 
-def wall(low: tuple[float, float], high: tuple[float, float], thickness: float) -> list[Part]:
-    rings = [ring(radius - inset, z, 12) for radius, z in (low, high) for inset in (0.0, thickness)]
-    rings += [np.roll(r, -1, axis=0) for r in rings]
-    return [hull([r[k] for r in rings]) for k in range(12)]
-
-
 def chain(points: Array, radii: Any) -> list[Part]:
     """Connect consecutive points by capsules."""
     parts = []
@@ -83,6 +79,21 @@ def chain(points: Array, radii: Any) -> list[Part]:
         R = Rotation.align_vectors([q - p], [[0.0, 0.0, 1.0]])[0].as_matrix()
         parts.append(solid(CAPSULE, (radius, np.linalg.norm(q - p) / 2.0, 0.0), (p + q) / 2.0, R))
     return parts
+
+
+def stretched(make: Callable[[Rng], Solid]) -> Maker:
+    """Make objects as the simulated scenes have them, in more proportions."""
+
+    def made(rng: Rng) -> list[Part]:
+        stretch = rng.uniform(0.6, 1.2, 3)
+        return [hull(stretch * part.vertices) for part in make(rng).polytopes]
+
+    return made
+
+
+bottle, bowl, mug, tray = map(
+    stretched, (generation.bottle, generation.bowl, generation.mug, generation.tray)
+)
 
 
 def box(rng: Rng) -> list[Part]:
@@ -105,44 +116,12 @@ def carton(rng: Rng) -> list[Part]:
     return [block(rng.uniform((0.02, 0.04, 0.05), (0.05, 0.09, 0.13)))]
 
 
-def bottle(rng: Rng) -> list[Part]:
-    """Make a body with shoulders; some bottles have a trigger or a handle."""
-    radius, height, steps = rng.uniform(0.018, 0.05), rng.uniform(0.08, 0.26), int(rng.integers(3, 6))
-    heights = np.sort([0.0, *rng.uniform(0.2, 0.95, steps - 1), 1.0]) * height + 1e-3 * np.arange(steps + 1)
-    radii = radius * np.concatenate([[1.0, 1.0], np.cumprod(rng.uniform(0.45, 1.05, steps - 1))])
-    parts = turned(list(zip(np.maximum(radii, 0.006).tolist(), heights.tolist(), strict=True)))
-    if rng.random() < 0.4:
-        size = rng.uniform(0.01, 0.03), 0.008, rng.uniform(0.005, 0.015)
-        parts.append(block(size, (rng.uniform(0.0, 0.02), 0.0, heights[-1])))
-    if rng.random() < 0.2:
-        parts.append(solid(CAPSULE, (0.007, 0.15 * height, 0.0), (radius + 0.015, 0.0, 0.45 * height)))
-    return parts
-
-
 def jar(rng: Rng) -> list[Part]:
     radius, height = rng.uniform(0.02, 0.05), rng.uniform(0.05, 0.15)
     lid = rng.uniform(0.7, 1.15) * radius
     return turned([(radius, 0.0), (radius, height)]) + turned(
         [(lid, height), (lid, height + rng.uniform(0.01, 0.04))]
     )
-
-
-def bowl(rng: Rng) -> list[Part]:
-    radius, height = rng.uniform(0.05, 0.1), rng.uniform(0.03, 0.08)
-    rings = [(0.5 * radius, 0.0), (0.85 * radius, 0.4 * height), (radius, height)]
-    floor = turned([(0.5 * radius, 0.0), (0.5 * radius, 0.005)])
-    return [part for low, high in pairwise(rings) for part in wall(low, high, 0.005)] + floor
-
-
-def mug(rng: Rng) -> list[Part]:
-    radius, height = rng.uniform(0.028, 0.05), rng.uniform(0.06, 0.12)
-    parts = wall((radius * rng.uniform(0.75, 1.0), 0.0), (radius, height), 0.005)
-    parts += turned([(0.75 * radius, 0.0), (0.75 * radius, 0.005)])
-    if rng.random() < 0.8:
-        angle, out = np.linspace(-np.pi / 2.0, np.pi / 2.0, 5), rng.uniform(0.018, 0.03)
-        across, up = radius - 0.003 + out * np.cos(angle), height / 2.0 + 0.33 * height * np.sin(angle)
-        parts += chain(np.stack([across, 0.0 * angle, up], axis=-1), [rng.uniform(0.004, 0.007)] * 4)
-    return parts
 
 
 def banana(rng: Rng) -> list[Part]:
@@ -216,14 +195,6 @@ def profile(rng: Rng) -> list[Part]:
         parts.append(block((half, width, height), (at + half, 0.0, height)))
         at += 2.0 * half
     return parts
-
-
-def tray(rng: Rng) -> list[Part]:
-    (x, y, z), thin = rng.uniform((0.05, 0.06, 0.015), (0.13, 0.17, 0.05)), 0.003
-    sides = [((thin, y, z), (s * x, 0.0, z)) for s in (-1, 1)] + [
-        ((x, thin, z), (0.0, s * y, z)) for s in (-1, 1)
-    ]
-    return [block((x, y, thin), (0.0, 0.0, thin)), *(block(size, at) for size, at in sides)]
 
 
 def plate(rng: Rng) -> list[Part]:

@@ -27,7 +27,6 @@ __version__ = "0.2.0"
 hooks |= {
     "notebook cell": "caryatid.viz.notebook:draw_cell",
     "viewer": "caryatid.viewer:show",
-    "warm-up": "caryatid.simulation.warm_up:warm_up",
 }
 
 __all__ = [

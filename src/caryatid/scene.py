@@ -23,7 +23,6 @@ from caryatid.objects.changes import ChangeDetector, appeared
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed, without
 from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
-from caryatid.runtime.compiling import compile_kernels
 from caryatid.runtime.display import Pictured, call
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.segmentation.holes import count_holes
@@ -92,7 +91,6 @@ class Scene(Pictured):
             raise InputError("segmentation", f"'{segmentation}' is unknown", "choose labels, auto or None")
         if seed < 0:
             raise InputError("seed", f"{seed} is negative", "give an integer of at least 0")
-        compile_kernels()
         self.config = config or Config()
         self.segmentation = segmentation
         self.seed = seed

@@ -55,15 +55,9 @@ class Episode:
     """One run of the loop: everything that, with the code, determines its figures.
 
     Attributes:
-        scene: Name of a built-in scene, or a scene folder.
-        content: Digest of a scene folder's files; empty for a built-in scene.
-        fusion: What is fused.
-        planner: Planner of the views.
-        plugin: Digest of the package that offers the planner; empty for built-in planners.
-        segmentation: Where segments come from.
-        noise: Noise of the camera.
-        preset: Settings to start from.
-        settings: Changes of these, `stage.name=value`.
+        scene: Name of a built-in scene, or a scene folder; `content` is the digest of its files.
+        planner: Planner of the views; `plugin` is the digest of the package that offers it, if it has one.
+        settings: Changes, `stage.name=value`, of the settings of the `preset`.
         views: Number of views, including the first.
         seed: Seed of the noise and of every choice.
         order: Order of removal; empty if nothing is removed.

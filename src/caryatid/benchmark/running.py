@@ -43,7 +43,7 @@ def run_locally(episodes: Sequence[Episode], jobs: int) -> Outcomes:
     others = set(active_children())
     pool = ProcessPoolExecutor(min(jobs, len(episodes)), get_context("spawn"), initializer=_end_with_parent)
     try:
-        with _interrupts_held():
+        with _interrupts_ignored():
             futures = {pool.submit(run_on_worker, episode, fingerprint()): episode for episode in episodes}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()
@@ -157,30 +157,23 @@ def _other_code(found: str) -> CaryatidError:
 def _end_with_parent() -> None:
     """End this process as soon as its parent is gone, for any reason."""
     parent = parent_process()
+    assert parent is not None
 
     def follow() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
+        parent.join()
+        os._exit(1)
 
     Thread(target=follow, daemon=True).start()
 
 
 @contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Delay Ctrl-C while processes are started; the processes never receive it, so they end quietly."""
-    if current_thread() is not main_thread() or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+def _interrupts_ignored() -> Iterator[None]:
+    """Ignore Ctrl-C while processes are started; they keep ignoring it, and end with this one."""
+    if current_thread() is not main_thread():
         yield
         return
-    held: list[int] = []
-    # The processes inherit the mask. Here another thread might receive Ctrl-C despite it, and half-started
-    # processes would be left behind, so a handler delays it.
-    handler = signal.signal(signal.SIGINT, lambda number, frame: held.append(number))
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         signal.signal(signal.SIGINT, handler)
-    if held:
-        raise KeyboardInterrupt

@@ -44,7 +44,6 @@ class Suite:
     """Methods × conditions × scenes × seeds.
 
     Attributes:
-        name: Its name on the command line.
         what: Its purpose, in one sentence.
         methods: The methods, each a line of a figure.
         scenes: Names of built-in scenes, or scene folders.
@@ -55,7 +54,6 @@ class Suite:
         gap: Two methods, such as random choice and the oracle, whose gap the others close in part.
     """
 
-    name: str
     what: str
     methods: Changes
     scenes: tuple[str, ...]
@@ -95,17 +93,8 @@ def change_suite(
 ) -> Suite:
     """Return a suite with other methods, conditions, settings or scenes; the rest stays.
 
-    Args:
-        suite: The suite.
-        planners: Replace its methods, each with the default fusion.
-        fusions: Fusions of each of its planners; methods that differ only in their fusion become one.
-        segmentations: Replace its conditions, together with every noise.
-        noises: Noise models of the camera.
-        preset: Settings to start from in all episodes.
-        settings: Changed in all episodes, `STAGE.NAME=VALUE`; a method's own go before.
-        scenes: Built-in names, scene folders and folders of them.
-        seeds: Number of seeds.
-        views: Views of every episode.
+    Planners replace the methods, each with the default fusion. With fusions, methods that differ only in
+    their fusion become one, with each of these. A method's own settings go before those given here.
 
     Raises:
         InputError: A setting does not exist, its value is not valid, or an option changes it; or a scene
@@ -225,131 +214,82 @@ def _ablation(planner: str, settings: Mapping[str, str]) -> Changes:
     return {**_planners(planner), **changed}
 
 
-_ALL = (
-    Suite(
-        "smoke",
+SUITES: Mapping[str, Suite] = {
+    "smoke": Suite(
         "Whether everything runs: few scenes, few views.",
-        {**_FIG5, **_planners("attention", "rear-side-voxel")},
-        ("tower", "pile-6-3", "dense-10-1"),
-        seeds=1,
-        views=3,
+        {**_FIG5, **_planners("attention", "rear-side-voxel")}, ("tower", "pile-6-3", "dense-10-1"),
+        seeds=1, views=3,
     ),
-    Suite(
-        "fig5",
+    "fig5": Suite(
         "The paper's Fig. 5: fusing points, graphs or both, against random views.",
-        _FIG5,
-        (*DESIGNED, *PILES, *DENSE[:16]),
-        views=10,
+        _FIG5, (*DESIGNED, *PILES, *DENSE[:16]), views=10,
     ),
-    Suite(
-        "fig5-paper",
+    "fig5-paper": Suite(
         "The paper's Fig. 5 by the paper's own system: its preset and planner, against random views.",
-        {label: {**_PAPER, **own} for label, own in _FIG5.items()},
-        MIXED,
-        seeds=1,
-        views=10,
+        {label: {**_PAPER, **own} for label, own in _FIG5.items()}, MIXED, seeds=1, views=10,
     ),
-    Suite(
-        "presets",
+    "presets": Suite(
         "What the departures from the paper change, over the same scenes.",
         {
             "default": {},
             "paper": _PAPER,
             **{f"paper, {label}": {**_PAPER, "settings": own} for label, own in _DEPARTURES.items()},
         },
-        MIXED,
-        seeds=1,
-        reference="paper",
+        MIXED, seeds=1, reference="paper",
     ),
-    Suite(
-        "planners",
+    "planners": Suite(
         "Which planner finds the support graph with the fewest views, in dense heaps.",
-        {**_planners(*_PLANNERS), **_planners(*VOLUMETRIC, **_FREE)},
-        DENSE,
-        reference="random",
+        {**_planners(*_PLANNERS), **_planners(*VOLUMETRIC, **_FREE)}, DENSE, reference="random",
         gap=("random", "oracle"),
     ),
-    Suite(
-        "path",
+    "path": Suite(
         "How long the path is until the support graph is good, in dense heaps.",
-        {**_planners("support", "random", "ring"), **_planners("proximity-count", **_FREE)},
-        DENSE,
-        views=10,
-        reference="random",
+        {**_planners("support", "random", "ring"), **_planners("proximity-count", **_FREE)}, DENSE,
+        views=10, reference="random",
     ),
-    Suite(
-        "ablation",
+    "ablation": Suite(
         "What the paper leaves open, one setting at a time, for the default planner.",
-        {**_ablation("support", _SUPPORT), **_TOP_DOWN},
-        DENSE[:16],
+        {**_ablation("support", _SUPPORT), **_TOP_DOWN}, DENSE[:16],
     ),
-    Suite(
-        "ablation-attention",
+    "ablation-attention": Suite(
         "What the paper leaves open, one setting at a time, for the planner `attention`.",
-        _ablation("attention", _ATTENTION),
-        DENSE[:16],
+        _ablation("attention", _ATTENTION), DENSE[:16],
     ),
-    Suite(
-        "poses",
+    "poses": Suite(
         "Fusing points, graphs or both, with poses as reported and with registration.",
         {**_FUSED, **{f"{label}, poses as reported": {**own, **_GIVEN} for label, own in _FUSED.items()}},
-        MIXED,
-        seeds=1,
-        views=10,
+        MIXED, seeds=1, views=10,
     ),
-    Suite(
-        "noise",
+    "noise": Suite(
         "What depth noise, wrong poses and automatic segments cost.",
-        _planners("support", "random"),
-        MIXED,
-        {**_NOISE, **_AUTO},
-        seeds=1,
+        _planners("support", "random"), MIXED, {**_NOISE, **_AUTO}, seeds=1,
     ),
-    Suite(
-        "house",
+    "house": Suite(
         "Household objects such as trays, bowls, mugs and bottles, with labels and without.",
-        _planners("support"),
-        _generated("house", 4, 12, 501, 30),
-        {LABELS: {}, **_AUTO},
-        seeds=1,
+        _planners("support"), _generated("house", 4, 12, 501, 30), {LABELS: {}, **_AUTO}, seeds=1,
     ),
-    Suite(
-        "easy",
+    "easy": Suite(
         "Automatic segments of piles of 4 to 20, and of equal boxes in rows, walls and pyramids.",
-        _planners("support"),
-        _generated("pile", 4, 20, 800, 60) + _generated("blocks", 2, 10, 800, 40),
-        _AUTO,
-        seeds=1,
+        _planners("support"), _generated("pile", 4, 20, 800, 60) + _generated("blocks", 2, 10, 800, 40),
+        _AUTO, seeds=1,
     ),
-    Suite(
-        "heaps",
+    "heaps": Suite(
         "Automatic segments of dense heaps, over ten views.",
-        _planners("support"),
-        _generated("dense", 10, 25, 700, 32),
-        _AUTO,
-        seeds=1,
-        views=10,
+        _planners("support"), _generated("dense", 10, 25, 700, 32), _AUTO, seeds=1, views=10,
     ),
-    Suite(
-        "dismantle",
+    "dismantle": Suite(
         "Whether piles can be taken apart without harm after 1, 3, 5 and 10 views.",
-        {order: {"order": order} for order in ORDERS},
-        (*DESIGNED, *HEAPED),
-        seeds=1,
-        views=10,
+        {order: {"order": order} for order in ORDERS}, (*DESIGNED, *HEAPED), seeds=1, views=10,
         reference="highest first",
     ),
-    Suite(
-        "full",
+    "full": Suite(
         "Every planner with every fusion under every condition; for a cluster.",
         {
             f"{planner} {label}": {"planner": planner, **own}
             for planner, (label, own) in product(_PLANNERS, _FUSED.items())
         },
-        (*DESIGNED, *PILES, *DENSE),
-        {"labels, no noise": {"noise": "none"}, LABELS: {}, **_NOISE, **_AUTO},
+        (*DESIGNED, *PILES, *DENSE), {"labels, no noise": {"noise": "none"}, LABELS: {}, **_NOISE, **_AUTO},
         views=10,
     ),
-)
-SUITES: Mapping[str, Suite] = {suite.name: suite for suite in _ALL}
+}  # fmt: skip
 """All suites by name."""

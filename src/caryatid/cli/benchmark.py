@@ -109,10 +109,10 @@ class Benchmark(options.Command):
             kept("finished episodes are kept; run the same command to continue"),
             ResultStore(self.out / RESULTS, code, about) as store,
         ):
-            missing = store.plan(suite.name, suite.members(), retry=self.retry) if suite else []
+            missing = store.plan(self.suite or "", suite.members(), retry=self.retry) if suite else []
             check_reference(self.reference, store)
-            if suite and missing:
-                self._run(suite.name, missing, store)
+            if self.suite and missing:
+                self._run(self.suite, missing, store)
             self._report(store)
 
     def _run(self, suite: str, missing: list[Episode], store: ResultStore) -> None:
@@ -121,12 +121,10 @@ class Benchmark(options.Command):
 
         from caryatid.benchmark.episodes import short_name
         from caryatid.benchmark.running import run_locally, run_on_cluster
-        from caryatid.runtime.compiling import compile_kernels
 
         if self.scheduler is not None:
             episodes = run_on_cluster(missing, self.scheduler, self.output.say)
         else:
-            compile_kernels()
             episodes = run_locally(missing, self.jobs or os.cpu_count() or 1)
         total = len({member.episode for member in store.suites[suite]})
         console = self.output.progress

@@ -263,7 +263,6 @@ class Serve(SessionStep):
         with needs_extra("serve", "serve"):
             from caryatid.service import SessionPool, check_token, make_app, run_service
         from caryatid.io.staging import write_errors
-        from caryatid.runtime.compiling import compile_kernels
 
         def listening(address: str) -> None:
             text = f"serving {self.folder} at {address} (API: {address}/openapi.json); press Ctrl-C to quit"
@@ -273,8 +272,6 @@ class Serve(SessionStep):
         check_token(self.host, token)
         with write_errors(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-        with self.output.working("compiling"):
-            compile_kernels()
         pool = SessionPool(self.folder, config, self.open_sessions, self.waiting)
         app = make_app(pool, token=token, max_request=self.max_request * 1_000_000, host=self.host)
         run_service(app, self.host, self.port, listening)

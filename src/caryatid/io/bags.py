@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from caryatid.config import RecordingConfig
 from caryatid.errors import InputError, needs_extra
@@ -29,17 +30,12 @@ TYPES: Final[Mapping[str, tuple[str, ...]]] = {
     "transforms": ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"),
 }
 """Kind of data → types of its messages."""
-DEPTH_ENCODINGS: Final[Mapping[str, str]] = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-"""Encodings of depth → type of a pixel: whole millimetres, or metres."""
-COLOUR_ENCODINGS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = {
-    "rgb8": (3, (0, 1, 2)),
-    "bgr8": (3, (2, 1, 0)),
-    "rgba8": (4, (0, 1, 2)),
-    "bgra8": (4, (2, 1, 0)),
-    "mono8": (1, (0, 0, 0)),
-    "8UC1": (1, (0, 0, 0)),
-}
-"""Encodings of colour → number of channels, and those that are red, green and blue."""
+DEPTH_ENCODINGS: Final = {"16UC1": "I;16", "mono16": "I;16", "32FC1": "F"}
+"""Encodings of depth → Pillow's mode: whole millimetres, or metres."""
+COLOUR_ENCODINGS: Final = {
+    "rgb8": "RGB", "bgr8": "BGR", "rgba8": "RGBX", "bgra8": "BGRX", "mono8": "L", "8UC1": "L",
+}  # fmt: skip
+"""Encodings of colour → Pillow's raw mode."""
 _CONFIG_HEADER: Final = struct.Struct("<iff")
 """Header of a compressed depth image: its format, and two parameters of inverse depth."""
 
@@ -122,15 +118,9 @@ class _Bag:
         if not connections:
             return
         with _damage(self.path):
-            messages = self._reader.messages(connections, *times)
-        while True:
-            with _damage(self.path):
-                item = next(messages, None)
-                if item is None:
-                    return
-                connection, received, data = item
+            for connection, received, data in self._reader.messages(connections, *times):
                 message = self._reader.deserialize(data, connection.msgtype)
-            yield connection.topic, int(received), message
+                yield connection.topic, int(received), message
 
     def images(self, topic: str, decode: Callable[[Any, str], NDArray[Any]]) -> list[TimedImage]:
         """All images of a topic, to be decoded from the message and the topic's name in errors."""
@@ -195,9 +185,10 @@ def decode_depth(message: Any, source: str, max_pixels: int) -> NDArray[np.float
     if hasattr(message, "format"):
         depth = _compressed_depth(message, source, max_pixels)
     else:
-        kind = _known(message, DEPTH_ENCODINGS, source)
-        pixels = _pixels(message, kind, 1, source)[:, :, 0]
-        depth = pixels if kind == "f4" else pixels * 0.001
+        mode = _known(message, DEPTH_ENCODINGS, source)
+        order = "B" if message.is_bigendian else ""
+        raw = f"F;32{order}F" if mode == "F" else f"I;16{order}"
+        depth = _pixels(message, mode, raw, source) * (1.0 if mode == "F" else 0.001)
     return np.where(np.isfinite(depth) & (depth > 0.0), depth, 0.0).astype(np.float32)
 
 
@@ -221,8 +212,9 @@ def decode_colour(message: Any, source: str, max_pixels: int) -> NDArray[np.uint
     """Colour (H, W, 3) of an image message, compressed or not; grey images have three equal channels."""
     if hasattr(message, "format"):
         return images.decode_image(message.data.tobytes(), source, max_pixels=max_pixels)
-    count, channels = _known(message, COLOUR_ENCODINGS, source)
-    return np.ascontiguousarray(_pixels(message, "u1", count, source)[:, :, channels])
+    raw = _known(message, COLOUR_ENCODINGS, source)
+    grey = _pixels(message, "L" if raw == "L" else "RGB", raw, source)
+    return np.stack([grey] * 3, axis=-1) if raw == "L" else grey
 
 
 def _known(message: Any, encodings: Mapping[str, Any], source: str) -> Any:
@@ -232,16 +224,17 @@ def _known(message: Any, encodings: Mapping[str, Any], source: str) -> Any:
     return encodings[message.encoding]
 
 
-def _pixels(message: Any, kind: str, channels: int, source: str) -> NDArray[Any]:
-    """Pixels (H, W, channels) of a raw image: rows may be padded, and numbers big-endian."""
-    dtype = np.dtype((">" if message.is_bigendian else "<") + kind)
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    row = width * channels * dtype.itemsize
+def _pixels(message: Any, mode: str, raw: str, source: str) -> NDArray[Any]:
+    """Pixels of a raw image (H, W), or (H, W, 3), by Pillow's modes; rows may be padded."""
+    width, height, step = int(message.width), int(message.height), int(message.step)
     data = np.asarray(message.data, dtype=np.uint8)
-    if not height or not width or step < row or data.size < height * step:
-        raise BrokenImageError(source, "an image has less data than its size requires", "record it again")
-    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
-    return rows.view(dtype).reshape(height, width, channels).astype(dtype.newbyteorder("="))
+    try:
+        if not 0 < width <= step or not 0 < height * step <= data.size:
+            raise ValueError
+        return np.array(Image.frombytes(mode, (width, height), data.tobytes(), "raw", raw, step))
+    except ValueError:
+        reason = "an image has less data than its size requires"
+        raise BrokenImageError(source, reason, "record it again") from None
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le
+from pydantic import BeforeValidator
 
 from caryatid.errors import InputError
 from caryatid.geometry.shapes import Uncertainty, from_size
@@ -81,14 +82,11 @@ class _Support:
     probability: Probability | None = None
 
 
-@dataclass(frozen=True)
-class _Stability:
+def _with_infinity(entry: Any) -> Any:
     """An entry of `stability`; JSON has no infinity, so an infinite overhang is null."""
-
-    ratio: float
-    overhang: float | None
-    small_area: bool
-    tips: bool
+    if isinstance(entry, dict) and entry.get("overhang", 0.0) is None:
+        return entry | {"overhang": inf}
+    return entry
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +95,7 @@ class _Graph:
     version: Literal[1]
     objects: list[_Object]
     supports: list[_Support]
-    stability: dict[str, _Stability] = field(default_factory=dict)
+    stability: dict[str, Annotated[Stability, BeforeValidator(_with_infinity)]] = field(default_factory=dict)
 
 
 def graph_to_json(graph: SupportGraph) -> dict[str, Any]:
@@ -169,10 +167,7 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
     return SupportGraph(
         tuple(o.decoded(name) for o in given.objects),
         tuple(Support(*vars(s).values()) for s in given.supports),
-        {
-            id_: Stability(s.ratio, inf if s.overhang is None else s.overhang, s.small_area, s.tips)
-            for id_, s in given.stability.items()
-        },
+        given.stability,
     )
 
 

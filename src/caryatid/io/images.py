@@ -54,14 +54,9 @@ def decode_image(
     what: str = "",
     max_pixels: int = MAX_PIXELS,
 ) -> NDArray[Any]:
-    """Decode a PNG or JPEG: (H, W), or (H, W, 3) if colour is allowed; grey then has three equal channels.
+    """Decode a PNG or JPEG, a file or its content: (H, W), or (H, W, 3) if colour is allowed.
 
-    Args:
-        image: A file, or its content.
-        name: Name of the content in errors.
-        modes: Allowed Pillow modes; None allows all.
-        what: Description of the expected image, for the error about its mode.
-        max_pixels: Maximum number of pixels; a larger image is not decoded.
+    Grey images then have three equal channels. Pillow's `modes` restrict it to `what` the error says.
 
     Raises:
         InputError: It is missing, broken, too large, or of another mode.

@@ -140,11 +140,8 @@ def choose_views(
     Going through time, the sharpest of the next frames is chosen whose viewpoint differs from all chosen
     ones. If there are too many, those farthest from each other stay.
 
-    Args:
-        times: Times of the frames (N,) [s], ascending; N > 0.
-        sharpness: Their sharpness (N,); only ratios count.
-        T_world_camera: Their poses (N, 4, 4). None if unknown; a single frame is then chosen.
-        config: Which frames are sharp, and how far apart viewpoints are.
+    Frames have ascending times (N,) [s], N > 0, sharpness (N,), of which only ratios count, and poses
+    (N, 4, 4). Without poses, a single frame is chosen.
 
     Returns:
         Indices of the chosen frames, ascending, and the number of others by reason.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import GetPydanticSchema, TypeAdapter, ValidationError
 from pydantic_core import core_schema, from_json
 
 from caryatid.errors import InputError
@@ -27,65 +27,49 @@ DECIMALS: Final = 9
 """Decimals of floats in files: a nanometre, far below the sensor's noise, far above rounding errors."""
 
 
-class Numbers:
-    """Marks a field that holds nested lists of finite numbers: `Annotated[Array, Numbers(4, 4)]`.
+def Numbers(*shape: int, rigid: bool = False) -> GetPydanticSchema:
+    """Mark a field of nested lists of finite numbers, such as a matrix, in an `Annotated` type.
 
     Args:
         *shape: Sizes; -1 = any.
         rigid: Whether they must be a rigid transform.
     """
+    schema: dict[str, Any] = {"type": "number"}
+    for size in reversed(shape):
+        schema = {"type": "array", "items": schema}
+        if size >= 0:
+            schema |= {"minItems": size, "maxItems": size}
+    read = partial(_read_numbers, shape, rigid)
+    return GetPydanticSchema(
+        lambda _, __: core_schema.no_info_plain_validator_function(read), lambda _, __: schema
+    )
 
-    def __init__(self, *shape: int, rigid: bool = False) -> None:
-        self.shape = shape
-        self.rigid = rigid
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Read the field with `read`."""
-        return core_schema.no_info_plain_validator_function(self.read)
-
-    def __get_pydantic_json_schema__(self, source: Any, handler: Any) -> dict[str, Any]:
-        """Describe the field as nested lists of these sizes."""
-        schema: dict[str, Any] = {"type": "number"}
-        for size in reversed(self.shape):
-            schema = {"type": "array", "items": schema}
-            if size >= 0:
-                schema |= {"minItems": size, "maxItems": size}
-        return schema
-
-    def read(self, value: Any) -> Array:
-        """Turn nested lists into an array (...) of this shape.
-
-        Raises:
-            ValueError: They have another shape, hold anything but finite numbers, or are not rigid.
-        """
-        try:
-            array = np.array(value)
-        except ValueError:
-            array = np.array("lists of different lengths")
-        if array.size == 0 and self.shape[0] < 0:
-            array = array.reshape(0, *self.shape[1:])
-        shape = tuple(n if n < 0 else m for n, m in zip(self.shape, array.shape, strict=False))
-        fits = array.ndim == len(self.shape) and shape == self.shape and array.dtype.kind in "if"
-        if not fits or not (np.abs(array) <= LARGEST).all():
-            sizes = "×".join("N" if n < 0 else str(n) for n in self.shape)
-            raise ValueError(f"must be {sizes} finite numbers")
-        array = array.astype(np.float64)
-        try:
-            return transforms.as_rigid(array, "") if self.rigid else array
-        except InputError as error:
-            raise ValueError(error.reason) from None
+def _read_numbers(shape: tuple[int, ...], rigid: bool, value: Any) -> Array:
+    """Turn nested lists into an array (...); raise a ValueError if it is not what `Numbers` asks for."""
+    try:
+        array = np.array(value)
+    except ValueError:
+        array = np.array("lists of different lengths")
+    if array.size == 0 and shape[0] < 0:
+        array = array.reshape(0, *shape[1:])
+    same = array.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
+    if not same or array.dtype.kind not in "if" or not (np.abs(array) <= LARGEST).all():
+        sizes = "×".join("N" if n < 0 else str(n) for n in shape)
+        raise ValueError(f"must be {sizes} finite numbers")
+    array = array.astype(np.float64)
+    try:
+        return transforms.as_rigid(array, "") if rigid else array
+    except InputError as error:
+        raise ValueError(error.reason) from None
 
 
 def parse_json(
     kind: Callable[..., T], document: Mapping[str, Any], source: str | Path, remedy: str = "correct it"
 ) -> T:
-    """Read a JSON object into a dataclass or a dict; other keys of dataclasses are ignored.
+    """Read a JSON object into a dataclass, whose fields are the keys, or a type of dict.
 
-    Args:
-        kind: A dataclass whose fields are the keys, with their types and defaults; or a type of dict.
-        document: The parsed object.
-        source: What to call it in the error.
-        remedy: What the user can do about an error.
+    Other keys of dataclasses are ignored. Errors name the source and the remedy.
 
     Raises:
         InputError: A key is missing, or a value is of another type; the sentence names the key.

@@ -30,13 +30,9 @@ SECOND = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class TimedImage:
-    """An image that is not decoded yet.
+    """An image that is not decoded yet: its time [ns], and the frame of its camera.
 
-    Attributes:
-        name: Its name.
-        time: When it was taken [ns].
-        frame: Frame of its camera.
-        decode: Returns depth (H, W) [m], or colour (H, W, 3). Raises `InputError` on failure.
+    `decode` returns depth (H, W) [m], or colour (H, W, 3), and raises `InputError` on failure.
     """
 
     name: str
@@ -47,15 +43,7 @@ class TimedImage:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TimedCamera:
-    """The pinhole camera at a time.
-
-    Attributes:
-        name: Its name in errors.
-        time: When [ns].
-        frame: Its frame.
-        K: Pinhole matrix (3, 3) [px].
-        size: Width and height of its images [px], or None for any size.
-    """
+    """The pinhole camera at a time [ns]: K (3, 3), and width and height of its images [px] if known."""
 
     name: str
     time: int
@@ -76,16 +64,10 @@ def make_video(
     config: RecordingConfig,
     notes: Sequence[str],
 ) -> Dataset:
-    """Find the colour, camera and pose of each depth image.
+    """Find the colour, camera and pose of each depth image; they are numbered in their order here.
 
-    Args:
-        path: File or folder.
-        depths: Depth images; they are numbered in this order.
-        colours: Colour images, or None to omit colour.
-        cameras: Cameras of the depth images, at least one.
-        pose_at: Pose (4, 4) of a frame at a time [ns], or None if unknown. None leaves poses out.
-        config: Maximum time between depth and colour, and maximum depth.
-        notes: Notes for the user.
+    `pose_at` gives the pose (4, 4) of a frame at a time [ns], or None if it is unknown. Without it, views
+    have no poses, and without `colours` no colour.
 
     Returns:
         The complete frames, ordered by time, and the number of others by reason.
@@ -185,15 +167,10 @@ class TransformTree:
         return sorted({*self._links, *self._fixed} | parents)
 
     def add(self, parent: str, child: str, time: int, pose: Sequence[float], *, fixed: bool = False) -> None:
-        """Add one pose, before the first query; of two at the same time, the later one counts.
+        """Add the pose of a child in its parent at a time [ns], before the first query.
 
-        Args:
-            parent: Frame the pose is given in.
-            child: Frame whose pose it is.
-            time: When [ns].
-            pose: Translation [m] and quaternion, w last, of any length but 0: seven numbers that fulfil
-                `is_pose`.
-            fixed: Whether it holds at all times, unless there are poses with times.
+        A pose fulfils `is_pose`; of two at the same time, the later one counts. A fixed one holds at all
+        times, unless there are poses with times.
         """
         if fixed:
             rotation = Rotation.from_quat(pose[3:]).as_matrix()

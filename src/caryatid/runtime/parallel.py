@@ -7,6 +7,7 @@ threads cost more than they save.
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,15 +18,74 @@ from threading import Lock
 from typing import Any, ParamSpec, TypeVar
 
 import numba
+import numpy as np
+from filelock import FileLock
 from numba import njit
 from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
 from threadpoolctl import ThreadpoolController
+
+from caryatid.errors import InputError
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
 
-kernel = partial(njit, cache=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True)
-"""Decorator of kernels: cached on disk, run without the GIL, not compiled for calls from C."""
+log = logging.getLogger(__name__)
+"""Reports that kernels are being compiled."""
+
+
+class KernelCache(FunctionCache):  # type: ignore[misc]
+    """numba's cache of a compiled kernel on disk, safe where several processes or changed sources share it.
+
+    numba notices that the file of a kernel has changed. This also notices a change of the kernels that it
+    calls and of the numbers that it uses, wherever they come from.
+
+    Raises:
+        InputError: No folder for compiled kernels is writable.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        try:
+            super().__init__(function)
+        except RuntimeError:
+            reason = "no writable folder for compiled kernels"
+            raise InputError("NUMBA_CACHE_DIR", reason, "set it to a writable folder") from None
+        used = [function.__globals__.get(name) for name in function.__code__.co_names]
+        called = (getattr(vars(u)["_cache"], "stamp", None) for u in used if isinstance(u, Dispatcher))
+        numbers = (repr(u) for u in used if isinstance(u, (int, float, tuple, np.ndarray)))
+        self.stamp = self._cache_file._source_stamp, *called, *numbers
+        self._cache_file._source_stamp = self.stamp
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Read a compiled kernel; None if it is new, damaged, or has types that have been renamed."""
+        try:
+            found = super().load_overload(sig, target_context)
+        except Exception:
+            self.flush()
+            found = None
+        if found is None and not any(Path(self.cache_path).glob("*.nbi")):
+            _tell_once("compiling kernels (once after installation, about 30 seconds)")
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep a compiled kernel; two processes that write the index of a kernel at once would garble it."""
+        with FileLock(Path(self.cache_path) / "kernels.lock"):
+            super().save_overload(sig, data)
+
+
+_tell_once = cache(log.info)
+
+
+def kernel(function: Any = None, **options: Any) -> Any:
+    """Decorate a kernel: cached on disk, run without the GIL, not compiled for calls from C."""
+    if function is None:
+        return partial(kernel, **options)
+    compiled: Any = njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True, **options)(function)
+    if not numba.config.DISABLE_JIT:
+        compiled._cache = KernelCache(function)
+    return compiled
+
+
 inner = partial(kernel, no_cpython_wrapper=True)
 """Decorator of kernels that only other kernels call."""
 
@@ -110,18 +170,6 @@ def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
     for share in shares:
         share.result()
     return results
-
-
-def _read_or_forget(self: FunctionCache, signature: Any, context: Any) -> Any:
-    """A cached kernel; a damaged one, or one with types that have been renamed, is compiled again."""
-    try:
-        return _read_kernel(self, signature, context)
-    except Exception:
-        self.flush()
-        return None
-
-
-_read_kernel, FunctionCache.load_overload = FunctionCache.load_overload, _read_or_forget
 
 
 @cache

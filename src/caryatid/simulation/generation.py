@@ -430,14 +430,15 @@ Ring = tuple[float, float]
 def thing(rng: np.random.Generator) -> Shape:
     """Draw a tray, a bowl, a mug or the like; four in ten are hollow."""
     makers: dict[Callable[[np.random.Generator], Shape], float] = {
-        _tray: 0.1, _bowl: 0.12, _mug: 0.12, _open_box: 0.06, _plate: 0.14,
-        _book: 0.14, _carton: 0.08, _can: 0.08, _bottle: 0.06, _fruit: 0.1,
+        tray: 0.1, bowl: 0.12, mug: 0.12, _open_box: 0.06, _plate: 0.14,
+        _book: 0.14, _carton: 0.08, _can: 0.08, bottle: 0.06, _fruit: 0.1,
     }  # fmt: skip
     shape = list(makers)[int(rng.choice(len(makers), p=list(makers.values())))](rng)
     return shape.moved(transforms.rigid(_yaw(rng), np.zeros(3)))
 
 
-def _tray(rng: np.random.Generator) -> Shape:
+def tray(rng: np.random.Generator) -> Solid:
+    """Draw a tray with a low rim."""
     return _hollow_box(*rng.uniform((0.2, 0.26, 0.03), (0.27, 0.36, 0.06)))
 
 
@@ -445,7 +446,7 @@ def _open_box(rng: np.random.Generator) -> Shape:
     return _hollow_box(*rng.uniform((0.11, 0.13, 0.07), (0.15, 0.2, 0.11)))
 
 
-def _hollow_box(x: float, y: float, z: float) -> Shape:
+def _hollow_box(x: float, y: float, z: float) -> Solid:
     """Four walls and a floor."""
     block = _hull([[a * x / 2.0, b * y / 2.0, c * z] for a in (-1, 1) for b in (-1, 1) for c in (0, 1)])
     along_x, along_y, up = np.eye(3)
@@ -453,16 +454,16 @@ def _hollow_box(x: float, y: float, z: float) -> Shape:
     return Solid.of(hollowed(block, [(up, WALL), *walls]))
 
 
-def _bowl(rng: np.random.Generator) -> Shape:
-    """Two rings of a wall that opens up, on a smaller floor."""
+def bowl(rng: np.random.Generator) -> Solid:
+    """Draw two rings of a wall that opens up, on a smaller floor."""
     foot, waist, rim = np.array([0.5, 0.85, 1.0]) * rng.uniform(0.07, 0.1)
     height = float(rng.uniform(0.05, 0.075))
     rings = [(foot, 0.0), (waist, 0.45 * height), (rim, height)]
     return Solid.of([part for low, high in pairwise(rings) for part in _wall(low, high)] + [_disc(foot)])
 
 
-def _mug(rng: np.random.Generator) -> Shape:
-    """A straight wall, a floor, and a handle of three bars."""
+def mug(rng: np.random.Generator) -> Solid:
+    """Draw a straight wall, a floor, and a handle of three bars."""
     radius, height = float(rng.uniform(0.036, 0.046)), float(rng.uniform(0.075, 0.1))
     bars = [
         _bar((radius + 0.01, 0.0, 0.25 * height), (0.024, 0.01, 0.01)),
@@ -472,8 +473,8 @@ def _mug(rng: np.random.Generator) -> Shape:
     return Solid.of([*_wall((radius, 0.0), (radius, height)), _disc(radius), *bars])
 
 
-def _bottle(rng: np.random.Generator) -> Shape:
-    """A body, a shoulder and a neck; nothing fits into it."""
+def bottle(rng: np.random.Generator) -> Solid:
+    """Draw a body, a shoulder and a neck; nothing fits into it."""
     radius, height = float(rng.uniform(0.03, 0.04)), float(rng.uniform(0.17, 0.24))
     rings = [(radius, 0.0), (radius, 0.6 * height), (0.013, 0.78 * height), (0.013, height)]
     return Solid.of([_hull([*_ring(a), *_ring(b)]) for a, b in pairwise(rings)])
