@@ -19,7 +19,7 @@ from caryatid.exploration import Step, explore
 from caryatid.sensing.views import Cloud
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
-from caryatid.viewer.page import Page, PageProcess
+from caryatid.viewer.page import Page
 
 POINTS = 300_000
 """Number of points of the cloud that is shown."""
@@ -44,22 +44,20 @@ def measure_viewer(effort: Effort) -> list[Row]:
         shown = [_until_shown(page, _numbered(large, k), browser) for k in range(effort.runs + 2)][2:]
     page.close()
 
-    process = PageProcess("benchmark", config.support, port=0)
-    server = psutil.Process(process._process.pid)
-    began = process._sender.submit(time.thread_time).result()
+    page = Page("benchmark", config.support)
+    began = time.process_time()
     for step in steps:
-        process.add(step)
-    cost = process._sender.submit(time.thread_time).result() - began
+        page.add(step)
+        page.wait()
+    cost = time.process_time() - began
     sizes = []
     counts = [effort.views // 10, effort.views // 2, effort.views]
     for first, last in zip([len(steps), *counts], counts, strict=False):
         for k in range(first, last):
-            process.add(_numbered(large, k))
-        process._sender.submit(lambda: None).result()
-        while server.cpu_percent(2.0) > 20.0:
-            pass
-        sizes.append(server.memory_info().rss / 1e6)
-    process.close()
+            page.add(_numbered(large, k))
+        page.wait()
+        sizes.append(psutil.Process().memory_info().rss / 1e6)
+    page.close()
 
     value, spread = median([1e3 * t for t in shown])
     what = f"from a view of {POINTS:,} points to its arrival in the browser"

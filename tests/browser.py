@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -13,18 +11,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from caryatid.geometry import transforms
+from caryatid.viz.pdf import find_chromium
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-"""What the program is called, in order of preference; the environment's CHROMIUM goes before."""
 ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
     "--disable-quic", "--disable-background-networking", "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-
-
-def find_program() -> str | None:
-    """Path of Chromium, if it is installed."""
-    return os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
 
 
 @contextmanager
@@ -33,7 +25,7 @@ def chromium() -> Iterator[Any]:
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=find_program(), args=ARGUMENTS)
+        browser = running.chromium.launch(executable_path=find_chromium(), args=ARGUMENTS)
         yield browser
         browser.close()
 
@@ -58,9 +50,9 @@ class Tab:
                 return
         route.continue_()
 
-    def open(self, url: str) -> None:
+    def open(self, url: str, resolution: float = 0.5) -> None:
         """Go to a viewer's page, at half resolution since it is drawn in software, and wait for its scene."""
-        self.page.goto(f"{url}?fixedDpr=0.5")
+        self.page.goto(f"{url}?fixedDpr={resolution}")
         self.page.wait_for_selector("canvas")
         self.wait_for_node("/shapes/o1")
         self.page.locator("#webgl-software-rendering button").click()

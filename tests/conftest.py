@@ -17,7 +17,7 @@ os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 import numba
 import numpy as np
 import pytest
-from browser import chromium, find_program
+from browser import chromium
 
 from caryatid import cli
 from caryatid.config import Config, SensorConfig
@@ -31,6 +31,7 @@ from caryatid.sensing.views import Cloud
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import ground_truth, write_truth
+from caryatid.viz.pdf import find_chromium
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # The workers share the cores: threads that wait for one that is taken hold up every parallel loop.
@@ -138,7 +139,7 @@ def run_command(*arguments: object) -> int:
 @pytest.fixture(scope="session")
 def browser():
     """Chromium, as playwright gives it."""
-    if find_program() is None:
+    if find_chromium() is None:
         if os.environ.get("CI"):
             pytest.fail("there is no Chromium: `make chromium` installs it")
         pytest.skip("there is no Chromium")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -15,7 +13,7 @@ import caryatid as ct
 from caryatid.geometry.shapes import KINDS
 from caryatid.geometry.solids import Polytope, Solid
 from caryatid.geometry.transforms import look_at
-from caryatid.graph import SceneObject, Support, SupportGraph, TakeStep
+from caryatid.graph import SupportGraph, TakeStep
 from caryatid.manipulation.order import Order
 from caryatid.planning.decision import Decision
 from caryatid.runtime.display import Pictured
@@ -157,23 +155,3 @@ def test_a_plain_line_says_what_it_is_without_its_arrays(shown, scene, steps):
         assert "\n" not in repr(thing)
         assert len(repr(thing)) < 300
         assert repr(thing).startswith(type(thing).__name__)
-
-
-def test_plain_lines_tell_one_from_another():
-    upright, edges = np.eye(4), tuple(Support("o1", f"o{k}") for k in range(2, 30))
-    box = ct.Box(upright, np.array([0.1, 0.2, 0.3]))
-    assert repr(box) == "Box(0.100 × 0.200 × 0.300 m at (0.000, 0.000, 0.000))"
-    doubtful = Support("o1", "o2", certain=False)
-    assert repr(doubtful) == "Support(o1 → o2, bottom-up, probability 0.50, found in 1 of 1)"
-    many = repr(SupportGraph((SceneObject("o1", 1, ct.Sphere(upright, 0.1)),), edges))
-    assert many.startswith("SupportGraph(vertices=1, edges=28: o1 → o2, ")
-    assert many.endswith("…)")
-
-
-@pytest.mark.slow
-def test_nothing_is_drawn_before_somebody_asks():
-    code = (
-        "import sys, numpy as np, caryatid as ct; box = ct.Box(np.eye(4), np.ones(3)); repr(box); ct.Scene;"
-        "assert not [m for m in sys.modules if m.startswith('caryatid.viz.notebook') or m == 'jinja2']"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -23,15 +23,13 @@ from caryatid import InputError, Scene
 from caryatid.errors import PlanningError
 from caryatid.exploration import explore
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Sphere
 from caryatid.graph import Support, SupportGraph
 from caryatid.io.graph_json import graph_text
 from caryatid.sources import open_source
 from caryatid.steps import read_run
-from caryatid.viewer.drawing import BY_HAND, EARLIER_POINTS, LAYERS, LETTER, SPACING, reduced, visible_points
-from caryatid.viewer.loop import LoopPage, candidate_under
-from caryatid.viewer.page import Page, PageProcess, describe_object, describe_view
-from caryatid.viewer.robot import RobotDrawing, stations
+from caryatid.viewer.drawing import BY_HAND, EARLIER_POINTS, LAYERS
+from caryatid.viewer.loop import LoopPage
+from caryatid.viewer.page import Page, describe_object, describe_view
 from caryatid.viz.colours import object_colour, rgb
 
 pytest.importorskip("viser")
@@ -64,9 +62,6 @@ def step(page):
     return page.steps[0]
 
 
-EYE = transforms.look_at((-1.0, -0.7, 1.3), (0.0, 0.0, 0.8))
-
-
 @pytest.fixture
 def drawn(page):
     """Draw a step and return the nodes of the scene by name."""
@@ -75,7 +70,7 @@ def drawn(page):
     page.wait()
 
     def draw(step, **look):
-        page.drawing.show(step, [step], T_world_eye=EYE, **look)
+        page.drawing.show(step, [step], **look)
         return {node.name: node for nodes in page.drawing.nodes.values() for node in nodes}
 
     yield draw
@@ -104,18 +99,12 @@ def test_shapes_and_points_have_their_objects_colours_and_places(step, drawn):
     np.testing.assert_array_equal(drawn(step, true_colours=True)["/cloud/points"].colors, cloud.rgb)
 
 
-def test_only_layers_that_changed_are_sent_again(step, drawn):
-    first = drawn(step)
-    again = drawn(step, point_size=0.01)
-    assert [name for name in first if first[name] is not again[name]] == ["/cloud/points"]
-
-
 def test_a_shape_moves_as_a_whole_and_is_not_replaced(step, drawn):
     graph, before = step.graph, drawn(step)
     T = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, 0.3)), (0.1, 0.0, 0.2))
     objects = [replace(o, shape=o.shape.moved(T)) if o.id == "o1" else o for o in graph.objects]
     after = drawn(replace(step, graph=replace(graph, objects=tuple(objects))))
-    for name in ("/shapes/o1", "/shapes/o1/edges", "/shapes/o2", "/names/o1"):
+    for name in ("/shapes/o1", "/shapes/o1/edges", "/shapes/o2"):
         assert after[name] is before[name]
     body, edges, shape = after["/shapes/o1"], after["/shapes/o1/edges"], objects[1].shape
     np.testing.assert_allclose(body.position, shape.T_world_object[:3, 3])
@@ -139,60 +128,25 @@ def test_what_is_hidden_is_not_sent_until_it_is_asked_for(opening, settings):
     page.close()
 
 
-def test_arrows_tell_direction_doubt_and_kind(page, step, drawn):
-    certain, eye, found = drawn(with_supports(step, Support("o1", "o2"))), EYE[:3, 3], page.drawing.anchors
-    (arrow,) = certain["/supports/arrow 0"].points.astype(float)
-    on_the_way = [(at - eye) / (found[name] - eye) for at, name in zip(arrow, ("o1", "o2"), strict=True)]
-    assert np.max(on_the_way) < 1.0  # before the shapes
-    along = transforms.unit(found["o2"] - found["o1"])
-    assert (arrow[1] - arrow[0]) @ along > 0.5 * np.linalg.norm(arrow[1] - arrow[0])
-    assert not {"/supports/dashes 0", "/supports/probability 0"} & certain.keys()
-    table = drawn(with_supports(step, Support("o0", "o1"), Support("o0", "o2", certain=False)))
-    assert [name for name in table if name.startswith("/supports/arrow")] == ["/supports/arrow 1"]
-    doubtful = drawn(with_supports(step, Support("o1", "o2", certain=False)))
-    assert len(doubtful["/supports/dashes 0"].points) > 1
-    assert doubtful["/supports/probability 0"].text == "0.50"
-    likely = drawn(with_supports(step, Support("o1", "o2", probability=0.83)))
-    assert likely["/supports/probability 0"].text == "0.83"
-    widths = [nodes["/supports/arrow 0"].shaft_radius for nodes in (doubtful, likely, certain)]
+def test_arrows_tell_direction_doubt_and_kind(step, drawn):
+    def of(*supports):
+        nodes = drawn(with_supports(step, *supports))
+        return {name.removeprefix("/supports/"): node for name, node in nodes.items() if "/supports" in name}
+
+    certain, (_, below, above) = of(Support("o1", "o2")), step.graph.objects
+    assert set(certain) == {"arrow 0"}
+    start, end = certain["arrow 0"].points[0].astype(float)
+    assert (end - start) @ (above.centre_world - below.centre_world) > 0.0
+    np.testing.assert_allclose(np.cross(end - start, above.centre_world - below.centre_world), 0.0, atol=1e-4)
+    assert set(of(Support("o0", "o1"), Support("o0", "o2", certain=False))) >= {"arrow 1"}
+    doubtful = of(Support("o1", "o2", certain=False))
+    assert len(doubtful["dashes 0"].points) > 1
+    assert doubtful["probability 0"].text == "0.50"
+    likely = of(Support("o1", "o2", probability=0.83))
+    assert likely["probability 0"].text == "0.83"
+    widths = [nodes["arrow 0"].shaft_radius for nodes in (doubtful, likely, certain)]
     assert widths == sorted(set(widths))
-    for kind in ("lean", "top-down"):
-        nodes = drawn(with_supports(step, Support("o1", "o2", kind)))
-        assert nodes["/supports/probability 0"].text == f"{kind} 1.00"
-
-
-def test_arrows_begin_and_end_beside_names_however_far_behind_each_other(page, step, drawn):
-    drawn(with_supports(step, Support("o1", "o2")))
-    for eye in ((-1.0, -0.7, 1.3), (-0.1, 0.0, 2.0)):
-        page.drawing.face(transforms.look_at(eye, (0.0, 0.0, 0.8)))
-        arrow = page.drawing.nodes["supports"][0].points[0].astype(float)
-        names = [page.drawing.anchors[name] for name in ("o1", "o2")]
-        ways = [[transforms.unit(at - eye) for at in pair] for pair in (arrow, names)]
-        least = min(0.6 * LETTER, 0.25 * np.linalg.norm(ways[1][1] - ways[1][0]))
-        assert (np.linalg.norm(np.subtract(*ways), axis=1) > 0.9 * least).all()
-
-
-def test_names_are_on_what_can_be_seen_of_their_objects():
-    """Seen from anywhere, a name is on its object's surface, and nothing is before it."""
-    rng, found = np.random.default_rng(5), 0
-    for _ in range(8):
-        places = [transforms.rigid(np.eye(3), rng.uniform(-0.2, 0.2, 3)) for _ in range(6)]
-        shapes = [
-            Box(T, rng.uniform(0.05, 0.2, 3)) if k % 2 else Sphere(T, 0.06) for k, T in enumerate(places)
-        ]
-        surfaces = [shape.surface(SPACING)[0] for shape in shapes]
-        owner = np.repeat(np.arange(6), [len(points) for points in surfaces])
-        eye = 1.2 * transforms.unit(rng.normal(size=3))
-        for number, at in visible_points(np.concatenate(surfaces), owner, eye).items():
-            found += 1
-            assert abs(shapes[number].signed_distance(at[None])[0]) < 1e-3
-            way = eye + np.linspace(0.0, 1.0, 500)[:, None] * (at - eye)
-            for shape in shapes:  # in up to 1 cm, the coarseness of what is seen
-                inside = shape.signed_distance(way) < -0.012
-                assert not inside.any()
-        alone = visible_points(surfaces[0], np.zeros(len(surfaces[0]), dtype=int), eye)[0]
-        assert np.linalg.norm(np.cross(alone - eye, places[0][:3, 3] - eye)) < 0.02
-    assert found > 30
+    assert of(Support("o1", "o2", "lean"))["probability 0"].text == "lean 1.00"
 
 
 def test_the_sphere_is_painted_and_cameras_show_what_they_saw(step, drawn):
@@ -207,16 +161,6 @@ def test_the_sphere_is_painted_and_cameras_show_what_they_saw(step, drawn):
     by_hand = replace(step, decision=decision)
     planned = tuple(nodes["/cameras/next"].color)
     assert planned != tuple(drawn(by_hand)["/cameras/next"].color) == BY_HAND
-
-
-def test_what_is_kept_of_a_step_is_small(step):
-    large = replace(
-        step.view, depth=np.tile(step.view.depth, (8, 8)), rgb=None, labels=None, normals_camera=None
-    )
-    kept = reduced(replace(step, view=large)).view
-    assert kept.depth.shape[1] < 480
-    field_of_view = [view.depth.shape[1] / view.K[0, 0] for view in (kept, large)]
-    assert field_of_view[0] == pytest.approx(field_of_view[1], 0.02)
 
 
 def test_the_panel_describes_an_object(step, settings):
@@ -283,24 +227,19 @@ def test_a_view_may_be_chosen_by_hand_and_another_fusion_and_planner(loop):
         loop.use_planner("nobody")
 
 
-def test_the_robot_drives_its_way_to_where_it_takes_the_view(loop, monkeypatch):
-    passed, drive = [], RobotDrawing.drive
-    monkeypatch.setattr(RobotDrawing, "drive", lambda robot: (drive(robot), passed.append(robot))[0])
+def test_the_robot_stands_where_it_took_the_view_and_its_way_leads_there(loop):
     loop.show_layer("robot", True)
     for _ in range(2):
         loop.turn()
-        loop.wait()
-    way, there = loop.steps[0].decision.waypoints, loop.steps[1].robot.posture
-    places = np.array(stations(way))
-    assert len(passed) >= len(places)
-    np.testing.assert_allclose(places[0][:3], way[0].platform_world)
-    assert np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1).max() < 0.051
-    (body,) = loop.drawing.nodes["robot"]
-    np.testing.assert_allclose(body.position[:2], there.platform_world[:2])
-    loop.go_to(0)
     loop.wait()
-    (body,) = loop.drawing.nodes["robot"]
-    np.testing.assert_allclose(body.position[:2], way[0].platform_world[:2])
+    base, links, way = loop.drawing.nodes["robot"]
+    there = loop.steps[1].robot
+    np.testing.assert_allclose(base.position[:2], there.posture.platform_world[:2])
+    np.testing.assert_allclose(links.points[-1, -1], there.T_world_camera[:3, 3], atol=1e-3)
+    ends = [loop.steps[0].robot.posture.platform_world, there.posture.platform_world]
+    np.testing.assert_allclose(
+        [way.points[0, 0, :2], way.points[-1, -1, :2]], [e[:2] for e in ends], atol=1e-3
+    )
 
 
 def test_earlier_views_keep_few_points_and_their_cameras_are_not_sent_again(step, settings):
@@ -325,17 +264,6 @@ def test_a_recording_ends_with_its_views(recording, settings):
     assert "no candidate views left" in [page.turn() for _ in range(4)][-1]
     page.close()
     assert [step.robot for step in page.steps] == [None] * 3
-
-
-def test_a_ray_points_at_the_view_it_first_meets(step):
-    sphere, candidates = step.sphere, step.candidates
-    wanted, centre = candidates.directions[7], sphere.centre_world
-    outside = centre + 3.0 * sphere.radius * wanted
-    for origin, direction in ((outside, -wanted), (centre, wanted)):
-        found = candidate_under(origin, direction, sphere, candidates, 0.1)
-        assert candidates.directions[found] @ wanted > np.cos(0.02)
-    for origin, direction in ((outside, wanted), (centre, np.array([0.0, 0.0, -1.0]))):
-        assert candidate_under(origin, direction, sphere, candidates, 0.1) is None
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -418,6 +346,7 @@ def test_a_built_in_scene_comes_before_a_run_of_its_name(kept_run, tmp_path, mon
 def test_only_the_viewers_own_page_with_its_token_comes_in(page):
     root, token = page.url.rsplit("/", 1)
     assert len(token) > 16
+    assert page.server.get_host() not in root
 
     def came(address, **headers):
         try:
@@ -441,7 +370,7 @@ def test_only_the_viewers_own_page_with_its_token_comes_in(page):
     for path, header in (("x", "Host: localhost"), ("/é", "Host: localhost"), ("/", "Origin: null")):
         with create_connection((there.hostname, there.port)) as connection:
             connection.sendall(f"GET {path} HTTP/1.1\r\n{header}\r\n\r\n".encode())
-            assert connection.recv(100).startswith(b"HTTP/1.1 403 ")
+            assert connection.recv(100)[9:13] in (b"400 ", b"403 ")
 
 
 @pytest.mark.parametrize(
@@ -478,7 +407,7 @@ def test_an_exploration_that_is_interrupted_is_kept_and_its_page_closed(scene_fi
     shown, waited = [], []
     monkeypatch.setattr("webbrowser.open", lambda url: None)
     _waiting(monkeypatch, lambda: waited.append(True))
-    whole = PageProcess.add
+    whole = Page.add
 
     def interrupted(page, step, f1):
         whole(page, step, f1)
@@ -486,7 +415,7 @@ def test_an_exploration_that_is_interrupted_is_kept_and_its_page_closed(scene_fi
         if step.index == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(PageProcess, "add", interrupted)
+    monkeypatch.setattr(Page, "add", interrupted)
     options = ("--no-early-stop", "--view", "--no-report", "--quiet", *SMALL)
     assert run_command("explore", scene_file, "--out", tmp_path / "run", *options) == 130
     assert shown == [0, 1]
@@ -548,15 +477,14 @@ def tab(page, browser):
 def test_the_first_sight_is_the_objects_with_their_names_on_them(page, tab):
     page.wait()
     tab.settle()
-    shot = np.asarray(Image.open(io.BytesIO(tab.page.screenshot())).convert("RGB"), dtype=int)
     box = tab.page.locator("canvas").first.bounding_box()
-    corners = []
-    for item in page.steps[-1].graph.objects[1:]:
-        u, v = map(round, tab.pixel(page, page.drawing.anchors[item.id]))
-        around = shot[v - 11 : v + 11, u - 16 : u + 16]
-        plate = np.abs(around - rgb(object_colour(item.label))).max(axis=-1) < 40
+    found = page.steps[-1].graph.objects[1:]
+    shot = np.asarray(Image.open(io.BytesIO(tab.page.screenshot())).convert("RGB"))
+    for item in found:
+        u, v = map(round, tab.pixel(page, item.centre_world))
+        plate = (shot[v - 6 : v + 6, u - 8 : u + 8] > 200).all(axis=-1)
         assert plate.mean() > 0.1, item.id  # the rest is letters and blur
-        corners += [tab.pixel(page, corner) for corner in item.shape.outline()]
+    corners = [tab.pixel(page, corner) for item in found for corner in item.shape.outline()]
     low, high = np.min(corners, axis=0) - (box["x"], box["y"]), np.max(corners, axis=0) - (box["x"], box["y"])
     room = box["width"], box["height"]
     assert (low > 0.0).all()

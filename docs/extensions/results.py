@@ -15,7 +15,7 @@ from caryatid.scene import Scene
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.viz.drawings import draw_solid
 from caryatid.viz.graph_drawing import draw_graph
-from caryatid.viz.pictures import picture_png
+from caryatid.viz.pictures import Picture, picture_svg
 
 _seen: dict[str, Any] = {}
 """The last result of each kind of the program that is running."""
@@ -50,10 +50,18 @@ def take_picture(block: Any, variables: dict[str, Any], configuration: Any) -> s
     graph, fit, view = (_seen.get(kind) for kind in ("graph", "fit", "view"))
     path = Path(next(variables["image_path_iterator"]))
     if graph is not None:
-        path.write_bytes(picture_png(draw_graph(graph)))
+        path = _write(draw_graph(graph), path)
     elif fit is not None:
-        path.write_bytes(picture_png(draw_solid(fit.shape)))
+        path = _write(draw_solid(fit.shape), path)
     else:
         Image.fromarray(view.rgb).save(path)
     _seen.clear()
     return str(figure_rst([str(path)], configuration["src_dir"]))
+
+
+def _write(picture: Picture, path: Path) -> Path:
+    """Write a picture as an SVG file; returns its path."""
+    path = path.with_suffix(".svg")
+    size = f'xmlns="http://www.w3.org/2000/svg" width="{picture.width:g}" height="{picture.height:g}"'
+    path.write_text(picture_svg(picture).replace("<svg", f"<svg {size}", 1), encoding="utf-8")
+    return path

@@ -4,8 +4,7 @@
     python docs/pictures/draw.py film
     python docs/pictures/draw.py viewer
 
-The same command always draws the same pictures. The first two commands draw with `caryatid.viz`, like
-reports, and reproduce each file byte for byte; the last one takes screenshots in Chromium.
+The first two commands draw with `caryatid.viz`, like reports; all take screenshots in Chromium.
 """
 
 from __future__ import annotations
@@ -17,13 +16,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
@@ -46,12 +44,13 @@ from caryatid.sources import open_source
 from caryatid.viewer.loop import LoopPage
 from caryatid.viz.drawings import Projection, draw_cloud, draw_image, draw_sphere
 from caryatid.viz.graph_drawing import draw_graph
-from caryatid.viz.pictures import Picture, own_style
-from caryatid.viz.report import draw_lift
+from caryatid.viz.pictures import Picture, area, dot, line, picture_svg
+from caryatid.viz.report import draw_lift, read_lift
 
 PICTURES = Path(__file__).parent
-TITLE = 24.0
-"""Height of a line of text above a picture [px]."""
+sys.path.insert(0, str(PICTURES.parents[1] / "tests"))
+from browser import Tab, chromium  # noqa: E402  (after the path)
+
 PLANE, NORMAL = 0.042, 0.05
 """Half the side of a drawn separating plane, and the length of its drawn normal [m]."""
 LOOK, KNOW, CHOOSE, END = 900, 2000, 2200, 4000
@@ -70,26 +69,16 @@ SOLIDS = (
 Titled = tuple[Picture, str]
 
 
-def sheet(pictures: Sequence[Titled], width: int, columns: int, heading: str = "") -> Image.Image:
-    """Arrange titled pictures on one page, in rows of cells of this width [px]."""
-    rows = [pictures[k : k + columns] for k in range(0, len(pictures), columns)]
-    heights = [TITLE + max(width * p.height / p.width for p, _ in row) for row in rows]
-    top = 1.4 * TITLE if heading else 0.0
-    size = np.array([columns * width, sum(heights) + top])
-    with own_style():
-        figure = Figure(figsize=tuple(size / 100.0), dpi=100)
-        figure.text(0.01, 1.0 - 0.5 * top / size[1], heading, va="center", fontsize=10)
-        for row, height in zip(rows, heights, strict=True):
-            for column, (picture, title) in enumerate(row):
-                tall = width * picture.height / picture.width
-                at = (column + 0.5) / columns, 1.0 - (top + TITLE / 2) / size[1]
-                figure.text(*at, title, ha="center", va="center")
-                bottom = 1.0 - (top + TITLE + tall) / size[1]
-                picture.put(figure, (column / columns + 0.005, bottom, 0.99 / columns, tall / size[1]))
-            top += height
-        content = io.BytesIO()
-        figure.savefig(content, format="png", metadata={"Software": None})
-    return Image.open(content).convert("RGB")
+def sheet(page: Any, pictures: Sequence[Titled], width: int, columns: int, heading: str = "") -> Image.Image:
+    """Arrange titled pictures in rows of cells of this width [px], with Chromium."""
+    cells = "".join(f"<div>{escape(title)}{picture_svg(picture)}</div>" for picture, title in pictures)
+    page.set_content(
+        f"<body style='margin: 0; font: 14px DejaVu Sans; text-align: center'><p style='margin: 8px; "
+        f"text-align: left' {'' if heading else 'hidden'}>{escape(heading)}</p><main style='display: grid; "
+        f"grid-template-columns: repeat({columns}, {width}px)'>{cells}</main></body>"
+    )
+    page.set_viewport_size({"width": columns * width, "height": 100})
+    return Image.open(io.BytesIO(page.screenshot(full_page=True))).convert("RGB")
 
 
 def plain(view: View, labels: NDArray[np.int32] | None = None, graph: SupportGraph | None = None) -> Picture:
@@ -103,23 +92,19 @@ def planes(step: Step, supports: Sequence[Support]) -> Picture:
     """Draw a view with the separating planes of supports and their normals."""
     view = step.view
     assert view is not None
-    base, projection = plain(view), Projection(view.pose, view.K, view.depth)
-
-    def draw(axes: Axes) -> None:
-        base.draw(axes)
-        for support in supports:
-            at, normal = support.contact_world, support.normal_world
-            if at is None or normal is None:
-                continue
-            colour = "#d55e00" if support.doubtful else "#3b4252"
-            u = transforms.perpendicular(normal)
-            v = np.cross(normal, u)
-            corners = [at + PLANE * (a * u + b * v) for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
-            axes.fill(*projection.project(np.array(corners))[0].T, color=colour, alpha=0.5)
-            foot, head = projection.project(np.stack([at, at + NORMAL * normal]))[0]
-            axes.arrow(*foot, *(head - foot), color=colour, width=2.0, length_includes_head=True)
-
-    return Picture(f"separating planes of {len(supports)} supports", base.width, base.height, draw)
+    base, projection, parts = plain(view), Projection(view.pose, view.K, view.depth), []
+    for support in supports:
+        at, normal = support.contact_world, support.normal_world
+        if at is None or normal is None:
+            continue
+        colour = "#d55e00" if support.doubtful else "#3b4252"
+        u = transforms.perpendicular(normal)
+        v = np.cross(normal, u)
+        corners = [at + PLANE * (a * u + b * v) for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+        parts.append(area(projection.project(np.array(corners))[0], colour, opacity=0.5))
+        ends = projection.project(np.stack([at, at + NORMAL * normal]))[0]
+        parts += [line(ends, colour, 2.0), dot(ends[1], 4.0, colour)]
+    return replace(base, name=f"separating planes of {len(supports)} supports", parts=[*base.parts, *parts])
 
 
 def azimuth_of(view: View) -> float:
@@ -127,7 +112,7 @@ def azimuth_of(view: View) -> float:
     return float(np.arctan2(-view.pose[1, 2], -view.pose[0, 2]))
 
 
-def concepts() -> dict[str, Image.Image]:
+def concepts(page: Any) -> dict[str, Image.Image]:
     """Draw a picture of each stage of the loop."""
     config = replace(Config(), active=replace(Config().active, max_views=4))
     scene = scene_from_spec(build_spec(SOLIDS, "concepts"), "concepts", "concepts", least=1.0)
@@ -152,7 +137,8 @@ def concepts() -> dict[str, Image.Image]:
     hands = SimulatedHands(scene, config)
     taken = [hands.take(lift, bodies) for lift in order.steps]
     supports = last.graph.supports
-    lifts = [draw_lift(scene, t, last.graph, views[0].pose, config) for t in taken if t.body is not None]
+    drawn = [draw_lift(scene, t, last.graph, views[0].pose, config) for t in taken if t.body is not None]
+    lifts = [read_lift(io.BytesIO(content)) for content in drawn]
     pages: dict[str, tuple[Sequence[Titled], int, int]] = {
         "view": ([(plain(views[0]), "colour"), (plain(pale), "depth, near is light")], 480, 2),
         "parts": ([(plain(views[0], first.labels, first.graph), "the segments on the table")], 640, 1),
@@ -184,10 +170,10 @@ def concepts() -> dict[str, Image.Image]:
         ),
         "order": ([(f.picture, f.heading) for f in lifts], 280, 4),
     }  # fmt: skip
-    return {name: sheet(*page) for name, page in pages.items()}
+    return {name: sheet(page, *content) for name, content in pages.items()}
 
 
-def film() -> tuple[list[Image.Image], list[int]]:
+def film(page: Any) -> tuple[list[Image.Image], list[int]]:
     """Explore a scene; return frames of the view, the model and the choice, and their durations [ms]."""
     scene, config = load_scene("clutter"), Config()
     truth = true_scene_from_simulation(scene, ground_truth(scene))
@@ -204,7 +190,7 @@ def film() -> tuple[list[Image.Image], list[int]]:
             (draw_graph(graph), "the support graph"),
         ]
         f1 = score(graph, truth).f1 if graph.objects else 0.0
-        images.append(sheet(pictures, 400, 2, f"view {number} · F1 {f1:.2f} · {phase}"))
+        images.append(sheet(page, pictures, 400, 2, f"view {number} · F1 {f1:.2f} · {phase}"))
         times.append(time)
 
     for step in explore(simulation.camera, simulation.robot, config=config, seed=0):
@@ -223,8 +209,6 @@ def film() -> tuple[list[Image.Image], list[int]]:
 @contextmanager
 def viewing(browser: Any, source: str, **options: Any) -> Iterator[tuple[LoopPage, Any]]:
     """Open a viewer's page, take its first view, and show it in a tab of Chromium."""
-    from browser import Tab
-
     opening = partial(open_source, source, noise="carmine", segmentation=None, seed=0)
     with closing(LoopPage(opening, Config(), **options)) as page:
         page.start()
@@ -234,47 +218,45 @@ def viewing(browser: Any, source: str, **options: Any) -> Iterator[tuple[LoopPag
         yield page, tab
 
 
-def viewer() -> Iterator[tuple[str, Image.Image]]:
+def viewer(browser: Any) -> Iterator[tuple[str, Image.Image]]:
     """Take screenshots of the viewer, with a scene and with a recording."""
-    sys.path.insert(0, str(PICTURES.parents[1] / "tests"))
-    from browser import chromium
 
     def shot(tab: Any) -> Image.Image:
         tab.page.wait_for_timeout(2000)  # The browser lays out text, then decodes pictures.
         tab.settle()
         return Image.open(io.BytesIO(tab.page.screenshot())).convert("RGB")
 
-    with chromium() as browser:
-        with viewing(browser, "clutter") as (page, tab):
-            yield "first", shot(tab)
-            for number in (2, 3):
-                tab.press("next view")
-                tab.wait_for_text(f"View {number} of {number}")
-            yield "views", shot(tab)
-            tab.click(page, page.drawing.anchors["o6"])
-            tab.wait_for_text("Without o6")
-            yield "object", shot(tab)
-            tab.press("clear")
-            page.wait()
-            tab.wait_for_text("finished")
-            yield "cleared", shot(tab)
-        with viewing(browser, "sample-recording", segmentation="auto") as (_, tab):
-            yield "recording", shot(tab)
+    with viewing(browser, "clutter") as (page, tab):
+        yield "first", shot(tab)
+        for number in (2, 3):
+            tab.press("next view")
+            tab.wait_for_text(f"View {number} of {number}")
+        yield "views", shot(tab)
+        page.describe("o6")
+        tab.wait_for_text("Without o6")
+        yield "object", shot(tab)
+        tab.press("clear")
+        page.wait()
+        tab.wait_for_text("finished")
+        yield "cleared", shot(tab)
+    with viewing(browser, "sample-recording", segmentation="auto") as (_, tab):
+        yield "recording", shot(tab)
 
 
 def main(what: Annotated[Literal["concepts", "film", "viewer"], tyro.conf.Positional]) -> None:
     """Draw the pictures of docs/concepts.md, the film of README.md, or the viewer of docs/runs.md."""
     known: dict[str, Any] = {"method": Image.Quantize.MEDIANCUT, "dither": Image.Dither.NONE}
-    if what == "film":
-        images, times = film()
-        first, *others = [image.quantize(256, **known) for image in images]
-        file = PICTURES / "explore.gif"
-        first.save(file, save_all=True, append_images=others, duration=times, loop=0, optimize=False)
-        return
-    pictures = viewer() if what == "viewer" else concepts().items()
-    for name, image in pictures:
-        file = f"viewer-{name}.png" if what == "viewer" else f"concepts/{name}.png"
-        image.quantize(256, **known).save(PICTURES / file, optimize=True)
+    with chromium() as browser:
+        if what == "film":
+            images, times = film(browser.new_page())
+            first, *others = [image.quantize(256, **known) for image in images]
+            file = PICTURES / "explore.gif"
+            first.save(file, save_all=True, append_images=others, duration=times, loop=0, optimize=False)
+            return
+        pictures = viewer(browser) if what == "viewer" else concepts(browser.new_page()).items()
+        for name, image in pictures:
+            file = f"viewer-{name}.png" if what == "viewer" else f"concepts/{name}.png"
+            image.quantize(256, **known).save(PICTURES / file, optimize=True)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.io.staging import write_file
 from caryatid.viz.colours import ink_on, object_colour, rgb
+from caryatid.viz.scene_3d import make_scene
 
 ENDINGS: Final[dict[str, ExportFormat]] = {
     ".xml": "mjcf",
@@ -169,23 +170,17 @@ def _numbers(*values: float) -> str:
 
 
 def _gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool) -> bytes:
-    """The node `z_up`, and under it a node per object, named by its id, in the report's colour."""
-    import trimesh
+    """A node per object, named by its id, in the report's colour."""
     from trimesh.exchange.gltf import export_glb, export_gltf
+    from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    # glTF has y up; the frame of the node `z_up` is caryatid's world.
-    T_file_world = [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
-    scene = trimesh.Scene(base_frame="file")
-    scene.graph.update(frame_from="file", frame_to="z_up", matrix=T_file_world)
-    for item in graph.objects:
-        mesh = item.shape.mesh(config.corners)
+    def look(item: SceneObject) -> TextureVisuals:
         colour = [*rgb(object_colour(item.label)), 255]
-        material = PBRMaterial(name=item.id, baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.8)
-        mesh.visual = trimesh.visual.TextureVisuals(material=material)
-        mesh.metadata = {"role": item.role, "shape": item.shape.kind, "size": item.shape.size}
-        names = {"node_name": item.id, "geom_name": item.id, "parent_node_name": "z_up"}
-        scene.add_geometry(mesh, **names, transform=item.shape.T_world_object)
+        known = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.8}
+        return TextureVisuals(material=PBRMaterial(name=item.id, **known))
+
+    scene = make_scene(graph, look, config.corners)
     content: bytes = export_glb(scene) if binary else export_gltf(scene, embed_buffers=True)["model.gltf"]
     return content
 

@@ -16,8 +16,8 @@ from caryatid.manipulation.order import plan_order
 from caryatid.runtime.parallel import cores
 from caryatid.sessions.reading import open_run, read_model
 from caryatid.steps import read_config, read_steps
-from caryatid.viz.pdf import render_pdf
-from caryatid.viz.report import make_report, read_lifts, render_html
+from caryatid.viz.pdf import print_pdf
+from caryatid.viz.report import make_report, read_lift, render_html
 from caryatid.viz.tables import census, order_line, order_table
 
 
@@ -112,12 +112,13 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
             about=" · ".join(filter(None, about)),
             settings=settings,
             scores=record.get("scores", ()),
-            strip=read_lifts(folder),
+            strip=[read_lift(path) for path in sorted((folder / "lifts").glob("*.png"))],
             warnings=record.get("warnings", ()),
             config=config.report,
         )
-    files = {} if pdf is None else {pdf: render_pdf(report)}
-    files[folder / "report.html"] = render_html(report).encode()
+    page = render_html(report)
+    files = {} if pdf is None else {pdf: print_pdf(page)}
+    files[folder / "report.html"] = page.encode()
     for path, content in files.items():
         write_file(path, content)
     return list(files)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import webbrowser
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict, fields
 from functools import partial
@@ -36,11 +36,11 @@ from caryatid.sessions.reading import open_run
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.sources import Source, extract, is_cloud, is_name, is_recording, open_source
 from caryatid.steps import RunWriter, is_run, is_session, lift_file, read_config, read_steps
-from caryatid.viz.report import draw_lift, lift_picture
+from caryatid.viz.report import draw_lift
 from caryatid.viz.tables import census, count_of
 
 if TYPE_CHECKING:
-    from caryatid.viewer.page import Page, PageProcess
+    from caryatid.viewer.page import Page
 
 
 def run_demo(command: Demo) -> None:
@@ -189,8 +189,8 @@ class RecordedLifts:
         self._camera.scene = self.hands.scene
         self.done.append({"view": len(writer.steps)} | taken.to_json() | {"state": state})
         if taken.body is not None and robot is not None:
-            drawn = draw_lift(self._camera.scene, taken, graph, robot.T_world_camera, self._config)
-            writer.files[lift_file(len(writer.steps))] = lift_picture(drawn)
+            lift = draw_lift(self._camera.scene, taken, graph, robot.T_world_camera, self._config)
+            writer.files[lift_file(len(writer.steps))] = lift
         return taken.body is not None
 
 
@@ -235,11 +235,12 @@ def _check_found(goal: str | None, last: Step) -> None:
 
 
 @contextmanager
-def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]:
+def _watched(name: str, config: Config, output: Output) -> Iterator[Page]:
     """Open a page for an exploration; after its end, keep the page open until Ctrl-C."""
-    from caryatid.viewer.page import PageProcess
+    from caryatid.viewer.page import Page
 
-    page = PageProcess(f"caryatid: {name}", config.support, port=VIEWER_PORT)
+    sys.setswitchinterval(0.0005)  # As in `view`.
+    page = Page(f"caryatid: {name}", config.support, port=VIEWER_PORT)
     output.say(f"{name} at {page.url}")
     webbrowser.open(page.url)
     try:
@@ -300,14 +301,14 @@ def _record(
     command: Explore | Extract | Clear,
     writer: RunWriter,
     name: str,
-    steps: Iterable[Step],
+    steps: Iterator[Step],
     truth: TrueScene | None = None,
-    page: PageProcess | None = None,
+    page: Page | None = None,
 ) -> Step:
     """Score, save, print and show every step; return the last."""
     output, last, conditions = command.output, None, _conditions(command)
     writer.more |= {"conditions": conditions, "warnings": output.warnings}
-    for step in steps:
+    for step in steps if page is None else page.in_turn(steps):
         scored = None if truth is None else score(step.graph, truth)
         writer.add(step, None if scored is None else asdict(scored))
         if last is None:

@@ -17,10 +17,9 @@ from caryatid.planning.decision import Decision
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Cloud, View
-from caryatid.viewer.robot import RobotDrawing
 from caryatid.viz.colours import SALIENCY_STOPS, Colour, label_colours, object_colour, rgb, scale
 from caryatid.viz.drawings import image_of
-from caryatid.viz.scene_3d import name_plate, support_ends
+from caryatid.viz.scene_3d import support_ends
 from caryatid.viz.tables import count_of
 
 LAYERS = {
@@ -35,28 +34,25 @@ EARLIER, NEXT, BY_HAND = (128, 136, 146), (11, 92, 148), (170, 30, 120)
 EARLIER_POINTS = 10_000
 """Points kept of the cloud of an earlier view, so that 200 views take less than 100 MB [1]."""
 ARROW = {"shaft_radius": 0.0035, "head_radius": 0.0095, "head_length": 0.02}
-"""Sizes of an arrow at 1 m from the eye [m]."""
-LETTER = 0.03
-"""Height of a name plate over its distance from the eye [1]."""
-SPACING = 0.008
-"""Distance between the points of surfaces that decide what can be seen [m]."""
-ON_TOP = 0.85
-"""Where names and arrows are between the eye, 0, and what they belong to, 1: before whatever is near it."""
+"""Sizes of an arrow [m]."""
+OPACITY, FAINT = 0.55, 0.2
+"""Of objects, through which arrows can be seen; and of all that is not chosen [1]."""
+CLEAR = 0.012
+"""Between the end of an arrow and the centre of its object, where its name is [m]."""
 SCREEN: dict[str, Any] = {"thickness": 1.6, "thickness_units": "screen"}
+MATT: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 
 
 def reduced(step: Step) -> Step:
     """The step reduced to what is drawn of it, so that the page can keep every step."""
     view, cloud, candidates, decision = step.view, step.cloud, step.candidates, step.decision
     if view is not None:
-        k = max(1, view.depth.shape[1] // 240)
-        rgb = None if view.rgb is None else view.rgb[::k, ::k].copy()
-        K = np.diag([1.0 / k, 1.0 / k, 1.0]) @ view.K
-        view = View(view.depth[::k, ::k].copy(), K, view.T_world_camera, rgb, name=view.name)
+        view = replace(view, labels=None, normals_camera=None, ignored=None)
+        view = view.every(max(1, view.depth.shape[1] // 240))
     points: Any = cloud.points_world.astype(np.float32)
     cloud = replace(cloud, points_world=points, normals_world=np.zeros(points.shape, np.int8))
-    sphere = replace(step.sphere, directions=step.sphere.directions[step.sphere.directions[:, 2] > 0.0])
-    sphere = replace(sphere, directions=sphere.directions[:: max(1, len(sphere.directions) // 900)])
+    upper = step.sphere.directions[step.sphere.directions[:, 2] > 0.0]
+    sphere = replace(step.sphere, directions=upper[:: max(1, len(upper) // 900)])
     if candidates is not None:
         none = candidates.T_world_camera[:0]
         candidates = replace(candidates, T_world_camera=none, path_length=none[:, 0, 0], indices=None)
@@ -92,9 +88,6 @@ class SceneDrawing:
 
     Attributes:
         nodes: What the browser shows, by layer, or layer and camera.
-        robot: The robot, once it is shown.
-        anchors: Where each object's name belongs (3,): a point of its surface that can be seen, by id; hidden
-            objects have none.
     """
 
     def __init__(self, server: Any, clicked: Callable[[str], None]) -> None:
@@ -103,11 +96,6 @@ class SceneDrawing:
         for name, shown in LAYERS.items():
             self._frames[name].visible = shown
         self._shown: dict[str, tuple[object, ...]] = {}
-        self._graph = SupportGraph()
-        self._shown_robot: RobotPose | None = None
-        self.robot: RobotDrawing | None = None
-        self._surface: tuple[SupportGraph, Array, NDArray[np.intp]] | None = None
-        self.anchors: dict[str, Array] = {}
         self.nodes: dict[str, list[Any]] = {name: [] for name in LAYERS}
 
     def show_layer(self, name: str, visible: bool) -> None:
@@ -119,26 +107,20 @@ class SceneDrawing:
         step: Step,
         steps: Sequence[Step],
         *,
-        T_world_eye: Array,
         chosen: str = "",
         point_size: float = 0.003,
         true_colours: bool = False,
     ) -> None:
-        """Show a step in place of the one before.
+        """Show a step, with the cameras of all steps so far, in place of the one before.
 
-        Args:
-            step: What is known.
-            steps: The steps so far, the newest last.
-            T_world_eye: Pose (4, 4) of the eye in the browser, OpenCV camera frame.
-            chosen: Id of the object that stands out.
-            point_size: Diameter of the cloud's points [m].
-            true_colours: Points as the camera saw them, not in their objects' colours.
+        An object may stand out; points have a diameter [m], and their objects' colours or their own.
         """
         decision = step.decision
         layers: dict[str, tuple[object, ...]] = {
             "cloud": (step.cloud, point_size, true_colours),
             "shapes": (step.graph, chosen if any(o.id == chosen for o in step.graph.objects) else ""),
-            "names": tuple((o.id, o.label) for o in step.graph.objects if o.role == "object"),
+            "names": (step.graph,),
+            "supports": (step.graph,),
             "sphere": (step.sphere, step.candidates, decision),
             "interest": (step.sphere, decision),
             "robot": (step.robot, steps[-2] if len(steps) > 1 else None),
@@ -150,7 +132,7 @@ class SceneDrawing:
             colour = BY_HAND if decision.why == "chosen by hand" else NEXT
             layers["cameras/next"] = "next", steps[-1].view, decision, colour
         with self._server.atomic():
-            for name in self._shown.keys() - layers.keys() - {"supports"}:
+            for name in self._shown.keys() - layers.keys():
                 del self._shown[name]
                 self._remove(name)
                 del self.nodes[name]
@@ -160,32 +142,6 @@ class SceneDrawing:
                     if layer != "shapes":
                         self._remove(name)
                     self.nodes[name], self._shown[name] = getattr(self, f"_{layer}")(*shown), shown
-            self._graph = step.graph
-            self.face(T_world_eye)
-
-    def face(self, T_world_eye: Array) -> None:
-        """Turn names and arrows to the eye (4, 4), each before what it belongs to."""
-        graph, eye_world, facing = self._graph, T_world_eye[:3, 3], _pose(T_world_eye)["wxyz"]
-        drawn = (graph, T_world_eye.round(4).tobytes(), self.nodes["names"])
-        if self._shown.get("supports") == drawn:
-            return
-        if self._surface is None or self._surface[0] is not graph:
-            numbers = [k for k, o in enumerate(graph.objects) if o.role != "support_surface"]
-            surfaces = [graph.objects[k].shape.surface(SPACING)[0] for k in numbers]
-            owner = np.repeat(np.array(numbers, dtype=np.intp), [len(points) for points in surfaces])
-            self._surface = graph, np.concatenate([*surfaces, np.zeros((0, 3))]), owner
-        found = visible_points(*self._surface[1:], eye_world)
-        self.anchors = {graph.objects[k].id: point for k, point in found.items()}
-        with self._server.atomic():
-            for node in self.nodes["names"]:
-                at = self.anchors.get(node.name.removeprefix("/names/"))
-                node.visible = at is not None
-                if at is not None:
-                    node.wxyz, node.position = facing, _nearer(eye_world, at)
-                    node.scale = LETTER * ON_TOP * float(np.linalg.norm(at - eye_world))
-            self._remove("supports")
-            self.nodes["supports"] = self._supports(graph, eye_world)
-        self._shown["supports"] = drawn
 
     def _remove(self, name: str, kept: Sequence[Any] = ()) -> None:
         """Remove a layer's nodes from the scene, but those kept."""
@@ -220,15 +176,15 @@ class SceneDrawing:
             mesh, T_world_object = item.shape.mesh(), item.shape.T_world_object
             name, colour = f"/shapes/{item.id}", rgb(object_colour(item.label))
             look = {"vertices": mesh.vertices, "faces": mesh.faces, "color": colour}
-            look |= {"opacity": 1.0 if chosen in (item.id, "") else 0.3} | _pose(T_world_object)
+            strong = OPACITY if item.role == "object" else 1.0
+            look |= {"opacity": strong if chosen in (item.id, "") else FAINT} | _pose(T_world_object)
             look["flat_shading"] = item.shape.kind == "box"
             ends = transforms.transform(transforms.invert(T_world_object), item.shape.creases())
             dark = (0.55 * np.array(colour)).astype(np.uint8)
             if name in known:
                 nodes.append(_changed(known[name], look))
             else:
-                still = {"side": "double", "cast_shadow": False, "receive_shadow": False}
-                nodes.append(self._scene.add_mesh_simple(name, **look, **still))
+                nodes.append(self._scene.add_mesh_simple(name, side="double", **look, **MATT))
                 nodes[-1].on_click(lambda _, name=item.id: self._clicked(name))
             edges = f"{name}/edges"
             if edges in known and len(ends):
@@ -238,65 +194,45 @@ class SceneDrawing:
         self._remove("shapes", nodes)
         return nodes
 
-    def _names(self, *named: tuple[str, int]) -> list[Any]:
-        nodes = []
-        for object_id, label in named:
-            plate = np.asarray(name_plate(object_id, label))
-            width = plate.shape[1] / plate.shape[0]
-            node = self._scene.add_image(
-                f"/names/{object_id}", plate, width, 1.0, cast_shadow=False, format="png"
-            )
-            node.on_click(lambda _, name=object_id: self._clicked(name))
-            nodes.append(node)
-        return nodes
+    def _names(self, graph: SupportGraph) -> list[Any]:
+        found = (item for item in graph.objects if item.role == "object")
+        return [self._label(f"/names/{item.id}", item.id, item.centre_world) for item in found]
 
     def _label(self, name: str, text: str, at: Array) -> Any:
-        look: dict[str, Any] = {"anchor": "bottom-center", "font_screen_scale": 0.85}
+        look: dict[str, Any] = {"anchor": "center-center", "font_screen_scale": 1.1}
         return self._scene.add_label(name, text, position=at, **look)
 
     def _lines(self, name: str, ends: Array, colours: Any, **look: Any) -> list[Any]:
         """Line segments (N, 2, 3), if there are any."""
         return [self._scene.add_line_segments(name, ends, colours, **look)] if len(ends) else []
 
-    def _arrow(
-        self, name: str, start: Array, end: Array, colour: Colour, share: float = 1.0, size: float = 1.0
-    ) -> Any:
-        """An arrow of a size, whose shaft has this share of the usual width."""
-        look = {part: size * length for part, length in ARROW.items()}
-        look["shaft_radius"] *= share
-        return self._scene.add_arrows(name, np.array([[start, end]]), colour, **look)
-
-    def _supports(self, graph: SupportGraph, eye_world: Array) -> list[Any]:
-        """Arrows from name to name, on top of the shapes; of the table only if doubtful."""
+    def _supports(self, graph: SupportGraph) -> list[Any]:
+        """Arrows from centre to centre, which show through the shapes; of the table only if doubtful."""
         nodes: list[Any] = []
         for number, support in enumerate(graph.supports):
             if graph[support.supporter].role == "support_surface" and not support.doubtful:
                 continue
-            start, end = (
-                _nearer(eye_world, self.anchors.get(name, end))
-                for name, end in zip(support.pair, support_ends(support, graph), strict=True)
-            )
-            along, size = end - start, float(np.linalg.norm(end - eye_world))
+            start, end = support_ends(support, graph)
+            along = end - start
             length = float(np.linalg.norm(along))
             if length < 1e-6:
                 continue
-            across = float(np.linalg.norm(np.cross(along, end - eye_world))) / size  # As long as it looks.
-            gap = min(0.6 * LETTER * size / max(across, 1e-6), 0.3)  # Names stay readable.
-            start, end, middle = start + gap * along, end - gap * along, (start + end) / 2.0
+            gap = min(CLEAR / length, 0.3)  # Names stay readable.
+            start, end = start + gap * along, end - gap * along
             colour, share = DOUBTFUL if support.doubtful else SURE, max(support.belief, 0.3)
             neck = start
             if support.doubtful:
-                neck = end - min(2.0 * size * ARROW["head_length"] / length, 0.5) * (end - start)
+                neck = end - min(2.0 * ARROW["head_length"] / length, 0.5) * (end - start)
                 count = max(2, round(float(np.linalg.norm(neck - start)) / 0.016))
-                dashes = np.linspace(start, neck, 2 * count).reshape(-1, 2, 3)
-                nodes += self._lines(
-                    f"/supports/dashes {number}", dashes, DOUBTFUL, thickness=0.007 * size * share
-                )
-            nodes.append(self._arrow(f"/supports/arrow {number}", neck, end, colour, share, size))
+                dashes, wide = np.linspace(start, neck, 2 * count).reshape(-1, 2, 3), 0.007 * share
+                nodes += self._lines(f"/supports/dashes {number}", dashes, DOUBTFUL, thickness=wide)
+            look = ARROW | {"shaft_radius": share * ARROW["shaft_radius"]}
+            points = np.array([[neck, end]])
+            nodes.append(self._scene.add_arrows(f"/supports/arrow {number}", points, colour, **look))
             kind = "" if support.kind == "bottom-up" else f"{support.kind} "
             if kind or support.belief < 0.995:
                 text = f"{kind}{support.belief:.2f}"
-                nodes.append(self._label(f"/supports/probability {number}", text, middle))
+                nodes.append(self._label(f"/supports/probability {number}", text, (start + end) / 2.0))
         return nodes
 
     def _sphere(self, sphere: ViewSphere, candidates: Any, decision: Any) -> list[Any]:
@@ -323,9 +259,7 @@ class SceneDrawing:
         colours = scale(np.array([p.saliency for p in points]), SALIENCY_STOPS)
         ends = sphere.centre_world + sphere.radius * np.array([p.direction for p in points])
         both = np.repeat(colours[:, None], 2, axis=1)
-        rays = self._lines(
-            "/interest/rays", np.stack([at, ends], axis=1), both, **(SCREEN | {"thickness": 1.0})
-        )
+        rays = self._lines("/interest/rays", np.stack([at, ends], axis=1), both, **SCREEN)
         return [self._points("/interest/points", at, colours, 0.02), *rays]
 
     def _cameras(self, name: str, view: View | None, following: Decision | None, colour: Colour) -> list[Any]:
@@ -339,59 +273,24 @@ class SceneDrawing:
         if view is None or T_world_camera is None:
             return []
         height, width = view.depth.shape
-        look |= _pose(T_world_camera) | SCREEN | {"cast_shadow": False, "receive_shadow": False}
+        look |= _pose(T_world_camera) | SCREEN | MATT
         angle, shape = 2.0 * float(np.arctan2(height / 2.0, view.K[1, 1])), width / height
         frustum = self._scene.add_camera_frustum(f"/cameras/{name}", angle, shape, color=colour, **look)
         return [frustum, self._label(f"/cameras/name {name}", name, T_world_camera[:3, 3] + [0.0, 0.0, 0.06])]
 
     def _robot(self, robot: RobotPose | None, before: Step | None) -> list[Any]:
-        """The robot; it drives there if it was shown at the view before."""
-        came = before is not None and before.robot is not None and before.robot is self._shown_robot
-        way = before.decision.waypoints if came and before is not None and before.decision else ()
-        self._shown_robot, self.robot = robot, RobotDrawing(self._scene, robot, way)
-        return self.robot.nodes
-
-
-def visible_points(points_world: Array, owner: NDArray[np.intp], eye_world: Array) -> dict[int, Array]:
-    """Find for each object a visible point of its surface, in the middle of what can be seen of it.
-
-    Points are put into a coarse image with the least depth in each pixel; a point is seen where none is more
-    than a centimetre nearer in its pixel and those around.
-
-    Args:
-        points_world: Points (N, 3) of all surfaces, `SPACING` apart.
-        owner: Number (N,) of the object of each.
-        eye_world: Position of the eye (3,) [m].
-
-    Returns:
-        A point (3,) by the object's number; objects that cannot be seen have none.
-    """
-    from scipy.ndimage import minimum_filter
-
-    if len(points_world) == 0:
-        return {}
-    T_world_eye = transforms.look_at(eye_world, points_world.mean(axis=0))
-    x, y, z = transforms.transform(transforms.invert(T_world_eye), points_world).T
-    before = np.flatnonzero(z > 0.02)
-    if len(before) == 0:
-        return {}
-    at = np.stack([x[before], y[before]], axis=1) / z[before, None]
-    pixels = ((at - at.min(axis=0)) * z[before].min() / SPACING).astype(int)  # No wider apart than a pixel.
-    depth = np.full(pixels.max(axis=0) + 1, np.inf)
-    np.minimum.at(depth, tuple(pixels.T), z[before])
-    seen = z[before] <= minimum_filter(depth, size=3)[tuple(pixels.T)] + 0.01
-    found = {}
-    for number in np.unique(owner[before[seen]]):
-        own = seen & (owner[before] == number)
-        middle = np.argmin(np.linalg.norm(at[own] - np.median(at[own], axis=0), axis=1))
-        found[int(number)] = points_world[before[own][middle]]
-    return found
-
-
-def _nearer(eye_world: Array, point_world: Array) -> Array:
-    """A point on the way from the eye, near what it hides."""
-    nearer: Array = eye_world + ON_TOP * (point_world - eye_world)
-    return nearer
+        """The robot's base with links to its camera, and the way it came."""
+        if robot is None:
+            return []
+        (x, y, _), eye = robot.posture.platform_world, robot.T_world_camera[:3, 3]
+        foot = np.array([x, y, eye[2] - robot.posture.camera_height])
+        elbow = (foot + eye) / 2.0 + (0.0, 0.0, 0.25) if robot.arm else np.array([x, y, eye[2]])
+        radius, place = 0.08 if robot.arm else robot.footprint, foot + (0.0, 0.0, 0.1)
+        nodes = [self._scene.add_cylinder("/robot/base", radius, 0.2, SURE, position=place, **MATT)]
+        nodes += self._lines("/robot/links", np.array([[foot, elbow], [elbow, eye]]), EARLIER, thickness=0.1)
+        stops = () if before is None or before.decision is None else before.decision.waypoints
+        way = np.array([[*stop.platform_world[:2], foot[2]] for stop in stops]).reshape(-1, 3)
+        return nodes + self._lines("/robot/way", np.stack([way[:-1], way[1:]], axis=1), SURE, **SCREEN)
 
 
 def _changed(node: Any, look: dict[str, Any]) -> Any:

@@ -4,37 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
-import secrets
-import signal
-import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from html import escape
-from importlib.util import find_spec
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from threading import RLock
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from caryatid.config import SupportConfig
-from caryatid.errors import InputError, missing_extra, needs_extra
 from caryatid.exploration import Step
-from caryatid.geometry import transforms
 from caryatid.graph import SupportGraph
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import direction
 from caryatid.support.relations import removal_of
+from caryatid.viewer.door import Door
 from caryatid.viewer.drawing import LAYERS, NEXT, SceneDrawing, reduced, step_of_scene, thinned
 from caryatid.viz.colours import SALIENCY_STOPS, object_colour, scale
-from caryatid.viz.drawings import draw_chart, draw_layers
+from caryatid.viz.drawings import draw_chart
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.notebook import cell_html
+from caryatid.viz.pictures import Picture, raster
 from caryatid.viz.report import Figure, Section
 from caryatid.viz.tables import census, noticed, object_table, support_table
 
@@ -58,7 +48,7 @@ class Page:
         drawing: The scene in the page.
         steps: The steps added so far.
         scores: F1 after each step, or None without ground truth.
-        working: Lock for compiled kernels: not every threading layer allows two threads to run them.
+        working: Lock for computing: two threads would change each other's number of BLAS threads.
 
     Raises:
         InputError: viser is not installed, or the page cannot be served.
@@ -74,24 +64,17 @@ class Page:
         small: bool = False,
     ) -> None:
         self.working = RLock()
-        token = secrets.token_urlsafe(16)
-        self.server: Any = _serve(title, host, port, token)
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}/{token}"
+        self._door = Door(title, host, port)
+        self.server, self.url = self._door.server, self._door.url
         self.steps: list[Step] = []
         self.scores: list[float | None] = []
         self.drawing = SceneDrawing(self.server, self.describe)
         self._support, self._small = support or SupportConfig(), small
         self._shown, self._chosen = -1, ""
         self._staged: Step | None = None
-        self._graph_drawn: SupportGraph | tuple[str, ...] | None = None
-        self._charted: list[float | None] = []
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
-        self._turning: Future[None] | None = None
-        self._driving: Future[None] | None = None
-        self._T_world_eye = transforms.look_at((-1.0, 0.0, 1.0), (0.0, 0.0, 0.0))
         self._build()
-        self.server.on_client_connect(self._follow)
 
     def say(self, text: str) -> None:
         """Show a message at the top of the page, replacing the previous one."""
@@ -141,31 +124,32 @@ class Page:
             self._staged = step
             self.redraw()
 
+    def in_turn(self, steps: Iterator[Step]) -> Iterator[Step]:
+        """Compute steps one by one, each while this page computes nothing."""
+        while True:
+            with self.working:
+                step = next(steps, None)
+            if step is None:
+                return
+            yield step
+
     def redraw(self) -> None:
         """Schedule drawing, unless it is already scheduled."""
-        self._pending = self._soon(self._pending, self._draw)
-
-    def _soon(self, pending: Future[None] | None, work: Callable[[], None]) -> Future[None] | None:
-        """Schedule work on the drawing thread, unless it is already scheduled."""
-        if pending is None or pending.running() or pending.done():
+        if self._pending is None or self._pending.running() or self._pending.done():
             with contextlib.suppress(RuntimeError):  # The page is being closed.
-                pending = self._drawer.submit(work)
-                pending.add_done_callback(_log_failure)
-        return pending
+                self._pending = self._drawer.submit(self._draw)
+                self._pending.add_done_callback(_log_failure)
 
     def wait(self) -> None:
         """Wait until everything is drawn, and raise drawing errors."""
         self._drawer.submit(lambda: None).result()
         if self._pending is not None:
             self._pending.result()
-        while (driving := self._driving) is not None and not driving.done():
-            self._drawer.submit(lambda: None).result()
 
     def close(self) -> None:
         """Stop serving the page."""
         self._drawer.shutdown(wait=True, cancel_futures=True)
-        with _silent():
-            self.server.stop()
+        self._door.close()
 
     def _repr_html_(self) -> str:
         """The page in a notebook cell."""
@@ -219,23 +203,6 @@ class Page:
         camera.look_at = centre
         camera.fov = 0.72  # Narrow, so that near objects do not hide far ones [rad].
         camera.position = centre + 3.2 * reach * direction(azimuth, 0.55)  # From 3.2 radii, all objects fit.
-        self._T_world_eye = transforms.look_at(camera.position, centre)
-
-    def _follow(self, client: Any) -> None:
-        """Keep names and arrows facing a client's camera."""
-
-        def moved(camera: Any) -> None:
-            rotation = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
-            self._T_world_eye = transforms.rigid(rotation, camera.position)
-            self._turning = self._soon(self._turning, lambda: self.drawing.face(self._T_world_eye))
-
-        client.camera.on_update(moved)
-
-    def _drive(self) -> None:
-        """Move the robot along its path, and schedule the next move until it arrives."""
-        if self.drawing.robot is not None and self.drawing.robot.drive():
-            time.sleep(0.03)
-            self._driving = self._soon(self._driving, self._drive)
 
     def _draw(self) -> None:
         steps, scores, chosen = self.steps[: self._shown + 1], [*self.scores], self._chosen
@@ -247,17 +214,12 @@ class Page:
         count, graph = len(self.steps), step.graph
         before = steps[-2] if len(steps) > 1 else None
         texts = [(self._summary, describe_view(step, f1, count, before))]
-        # While an object is lifted, only the places of the vertices change.
-        drawn = graph if self._staged is None else tuple(o.id for o in graph.objects)
-        if drawn != self._graph_drawn:
-            self._graph_drawn = drawn
-            picture = draw_graph(graph, compact=True)
-            texts.append((self._graph, cell_html(Section("", figures=[Figure("", picture)]))))
-        if scores != self._charted and any(f1 is not None for f1 in scores):
-            self._charted = scores
+        drawn = Figure("", draw_graph(graph, compact=True))
+        texts.append((self._graph, cell_html(Section("", figures=[drawn]))))
+        if any(f1 is not None for f1 in scores):
             known = [np.nan if f1 is None else f1 for f1 in scores]
-            chart = draw_chart("F1 after each view", "F1", {"F1": known}, top=1.0)
-            texts.append((self._chart, cell_html(Section("", figures=[Figure("", chart)]))))
+            chart = Figure("", draw_chart("F1 after each view", "F1", {"F1": known}, top=1.0))
+            texts.append((self._chart, cell_html(Section("", figures=[chart]))))
         if chosen:
             with self.working:
                 gone = {each.lift.object_id for each in steps if each.lift is not None}
@@ -266,13 +228,12 @@ class Page:
         look = {"point_size": self._size.value / 1000.0, "true_colours": self._true_colours.value}
         # Scene and texts change together.
         with self.server.atomic():
-            self.drawing.show(step, steps, T_world_eye=self._T_world_eye, chosen=chosen, **look)
+            self.drawing.show(step, steps, chosen=chosen, **look)
             self._slider.visible = count > 1
             self._slider.max = max(count, 2)
             self._slider.value = self._shown + 1
             for panel, text in texts:
                 panel.content = text
-        self._driving = self._soon(self._driving, self._drive)
 
 
 def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
@@ -321,10 +282,12 @@ def _describe_signs() -> str:
         "Coloured dots on the sphere": "candidate views that the robot can reach, coloured by saliency",
         "Fine grey dots": "views out of reach",
         "Balls with rays": "points of interest, and the views that show them best",
+        "Grey robot": "where it stands, and as a line on the floor, the way it came",
         "Grey cameras": "earlier views with their images; the newest is black and larger",
         "Filled camera": "next view: blue = chosen by the planner, pink = chosen by hand",
     }
-    picture = draw_layers("saliency", [scale(np.tile(np.linspace(-1.0, 1.0, 340), (10, 1)), SALIENCY_STOPS)])
+    bar = scale(np.tile(np.linspace(-1.0, 1.0, 340), (10, 1)), SALIENCY_STOPS)
+    picture = Picture("saliency", 340.0, 10.0, [raster(bar, 0.0, 0.0, 340.0, 10.0)])
     caption = "Saliency: from low (already seen) to high (look here); the maximum of each view is red."
     return cell_html(Section("Key", facts=[*signs.items()], figures=[Figure("", picture, caption)]))
 
@@ -352,132 +315,8 @@ def describe_object(
     return cell_html(Section(item.id, item.shape.kind, facts=facts, colour=object_colour(item.label)))
 
 
-# A page in another process
-
-
-class PageProcess:
-    """A page in another process; it only takes steps.
-
-    Args:
-        title: What the page is of.
-        support: Settings that the graphs were inferred with.
-        port: Port to listen at, or the next free one; 0 = any that is free.
-
-    Attributes:
-        url: Where the page is.
-
-    Raises:
-        InputError: viser is not installed, or the page cannot be served.
-    """
-
-    def __init__(self, title: str, support: SupportConfig, port: int) -> None:
-        if find_spec("viser") is None:
-            raise missing_extra("view", "viser", "viewer")
-        context = get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_show_sent, args=(theirs, title, support, port), daemon=True)
-        self._process.start()
-        theirs.close()
-        try:
-            self.url: str = self._connection.recv()
-        except EOFError:
-            raise InputError("viewer", f"cannot be served on port {port}", "choose another port") from None
-        self._sender = ThreadPoolExecutor(1, "viewer")
-
-    def add(self, step: Step, f1: float | None = None) -> None:
-        """Add a step; it is sent as soon as those before it are, unless the page is gone."""
-        self._sender.submit(lambda: self._connection.send((reduced(step), f1)))
-
-    def close(self) -> None:
-        """Stop serving the page, once all that was added has been sent."""
-        self._sender.shutdown()
-        self._connection.close()
-        self._process.join()
-
-
-def _show_sent(connection: Connection, title: str, support: SupportConfig, port: int) -> None:
-    """Serve a page and show the steps that arrive, until the connection closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if hasattr(os, "nice"):
-        os.nice(10)  # Where cores are scarce, the loop goes first.
-    page = Page(title, support, port=port)
-    connection.send(page.url)
-    try:
-        while True:
-            page.add(*connection.recv())
-    except EOFError:
-        page.close()
-
-
 def _log_failure(drawn: Future[None]) -> None:
     """Log an error of the drawing thread; the page keeps showing the step before."""
     error = None if drawn.cancelled() else drawn.exception()
     if error is not None:
         logging.getLogger(__name__).error("the viewer failed to draw a view", exc_info=error)
-
-
-def _serve(title: str, host: str, port: int, token: str) -> Any:
-    with needs_extra("view", "viewer"):
-        import viser
-        from websockets.asyncio import server as sockets
-
-    # viser would wait forever for a server that cannot start.
-    try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        socket.create_server((host, 0), family=family).close()
-    except OSError:
-        raise InputError(host, "is not an address of this machine", "choose another --host") from None
-    if not 0 <= port < 2**16:
-        raise InputError(f"port {port}", "is out of range", "choose 0 to 65535")
-
-    class Server(viser.ViserServer):
-        """A server whose page stays on this machine: nobody can ask for a public address."""
-
-        def request_share_url(self, verbose: bool = True) -> str | None:
-            return None
-
-    whole = sockets.serve
-
-    def guarded(*given: Any, process_request: Any, **options: Any) -> Any:
-        def answer(connection: Any, request: Any) -> Any:
-            if not _is_allowed(request, host, token):
-                return connection.respond(403, "open the full address that caryatid printed\n")
-            request.path = request.path.removeprefix(f"/{token}")
-            return process_request(connection, request)
-
-        return whole(*given, process_request=answer, **options)
-
-    # viser has no option that restricts access, and it serves before it returns.
-    setattr(sockets, "serve", guarded)  # noqa: B010  (mypy knows the class)
-    try:
-        with _silent():
-            return Server(host=host, port=port, label=title, verbose=False)
-    finally:
-        setattr(sockets, "serve", whole)  # noqa: B010
-
-
-def _is_allowed(request: Any, host: str, token: str) -> bool:
-    """Whether a request has the token, names this machine, and comes from the viewer's own page."""
-    try:
-        (named,) = request.headers.get_all("Host")
-        name = urlsplit(f"//{named}").hostname
-        _, first, *_ = request.path.partition("?")[0].encode().split(b"/")
-    except ValueError:
-        return False
-    known = name in {"127.0.0.1", "localhost", "::1", host} or (name and host in ("0.0.0.0", "::", ""))
-    origins = request.headers.get_all("Origin")
-    ours = all(origin in (f"http://{named}", f"https://{named}") for origin in origins)
-    return bool(known and ours and secrets.compare_digest(first, token.encode()))
-
-
-@contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Keep viser from printing."""
-    import rich
-
-    console = rich.get_console()
-    before, console.quiet = console.quiet, True
-    try:
-        yield
-    finally:
-        console.quiet = before

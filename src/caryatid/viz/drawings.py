@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +22,22 @@ from caryatid.sensing.view_sphere import direction
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.viz import colours
 from caryatid.viz.colours import object_colour
-from caryatid.viz.pictures import SOFT, Picture, Tag, put_raster, put_tags
+from caryatid.viz.pictures import (
+    INK,
+    LINE,
+    SOFT,
+    Picture,
+    Tag,
+    area,
+    dot,
+    draw_tags,
+    group,
+    line,
+    raster,
+    text,
+)
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from caryatid.exploration import Step
 
 DARK, VISITED = "#111111", "#2d3748"
@@ -72,52 +84,22 @@ class Projection:
         return Tag(float(x), float(y), item.id, object_colour(item.label))
 
 
-Strokes = Sequence[dict[str, Any]]
-"""Lines as a picture shows them: arguments of matplotlib's `LineCollection`, in the order of drawing."""
-
-
-def _strokes(objects: Sequence[SceneObject], projection: Projection) -> Strokes:
-    """Lines of shapes, the support surface first: strong on a dark rim, thin and faint where hidden."""
+def draw_shapes(objects: Sequence[SceneObject], projection: Projection) -> Element:
+    """Draw the lines of shapes, the surface first: strong on a dark rim, thin and faint where hidden."""
     from scipy.ndimage import median_filter
 
-    whole, seen, colour, width = [], [], [], []
+    faint, rims, strong = [], [], []
     for item in sorted(objects, key=lambda o: o.role != "support_surface"):
         lines = item.shape.lines(projection.T_world_camera[:3, 3])
         pixels, z = projection.project(np.concatenate(lines))
         hidden = median_filter(projection.hidden(pixels, z), size=5, mode="nearest")
-        ends = np.cumsum([len(line) for line in lines])[:-1]
-        whole.append(np.insert(pixels, ends, np.nan, axis=0))
-        seen.append(np.insert(np.where(hidden[:, None], np.nan, pixels), ends, np.nan, axis=0))
-        colour.append(object_colour(item.label))
-        width.append(1.2 if item.role == "support_surface" else 2.2)
-    return [
-        {"segments": whole, "colors": colour, "linewidths": 1.0, "alpha": 0.6},
-        {"segments": seen, "colors": DARK, "linewidths": np.add(width, 1.4), "alpha": 0.5},
-        {"segments": seen, "colors": colour, "linewidths": width},
-    ]
-
-
-def _put_strokes(axes: Axes, strokes: Strokes) -> None:
-    from matplotlib.collections import LineCollection
-
-    for stroke in strokes:
-        lines = LineCollection(**stroke, capstyle="round", zorder=5.0, gid="shapes|")
-        axes.add_collection(lines, autolim=False)
-
-
-def draw_layers(
-    name: str, layers: Sequence[NDArray[np.uint8]], strokes: Strokes = (), tags: Sequence[Tag] = ()
-) -> Picture:
-    """Draw images (H, W, C) of one size above each other, shapes over them, and names on top."""
-    height, width = layers[0].shape[:2]
-
-    def draw(axes: Axes) -> None:
-        for layer in layers:
-            put_raster(axes, layer, 0.0, 0.0, width, height)
-        _put_strokes(axes, strokes)
-        put_tags(axes, tags, 15.0)
-
-    return Picture(name, width, height, draw)
+        ends = np.cumsum([*map(len, lines)])[:-1]
+        seen = np.insert(np.where(hidden[:, None], np.nan, pixels), ends, np.nan, axis=0)
+        colour, width = object_colour(item.label), 1.2 if item.role == "support_surface" else 2.2
+        faint.append(line(np.insert(pixels, ends, np.nan, axis=0), colour, 1.0, opacity=0.6))
+        rims.append(line(seen, DARK, width + 1.4, opacity=0.5))
+        strong.append(line(seen, colour, width))
+    return group([*faint, *rims, *strong], "shapes")
 
 
 # The camera's image
@@ -139,12 +121,12 @@ def draw_image(
     step = max(1, view.depth.shape[1] // (4 * width))  # of what is shown, two pixels for each drawn
     if step > 1:
         view, labels = view.every(step), labels[::step, ::step]
-    window = left, top, right, bottom = _window(labels)
+    shown = left, top, right, bottom = window(labels)
     scale = width / (right - left)
     size = width, round((bottom - top) * scale)
 
     def resized(image: NDArray[Any], method: Image.Resampling = Image.Resampling.NEAREST) -> NDArray[Any]:
-        return np.asarray(Image.fromarray(image).resize(size, method, window))
+        return np.asarray(Image.fromarray(image).resize(size, method, shown))
 
     image, labels = resized(image_of(view), Image.Resampling.BOX), resized(labels)
     tags = []
@@ -152,15 +134,16 @@ def draw_image(
         v, u = np.nonzero(labels == item.label)
         if len(u):
             tags.append(Tag(float(np.median(u)), float(np.median(v)), item.id, object_colour(item.label)))
-    strokes: Strokes = ()
+    parts = [raster(image, 0.0, 0.0, *size), raster(tint(image, labels), 0.0, 0.0, *size, "segments")]
     if shapes and view.T_world_camera is not None:
         K = np.array([[scale, 0.0, -scale * left], [0.0, scale, -scale * top], [0.0, 0.0, 1.0]]) @ view.K
         projection = Projection(view.T_world_camera, K, resized(view.depth))
-        strokes = _strokes(graph.objects, projection)
+        parts.append(draw_shapes(graph.objects, projection))
         unseen = [projection.tag(o)._replace(faint=True) for o in found if o.label not in labels]
         tags += [tag for tag in unseen if np.isfinite(tag.x)]
     what = "segments and fitted shapes" if shapes else "segments"
-    return draw_layers(f"{view.name} with its {what}", [image, _tint(image, labels)], strokes, tags)
+    parts += draw_tags(tags, *size, 15.0)
+    return Picture(f"{view.name} with its {what}", *size, parts)
 
 
 def image_of(view: View) -> NDArray[np.uint8]:
@@ -172,7 +155,7 @@ def image_of(view: View) -> NDArray[np.uint8]:
     return np.where(view.valid[..., None], colours.scale(share, colours.DEPTH_STOPS), np.uint8(0))
 
 
-def _tint(image: NDArray[np.uint8], labels: NDArray[np.int32]) -> NDArray[np.uint8]:
+def tint(image: NDArray[np.uint8], labels: NDArray[np.int32]) -> NDArray[np.uint8]:
     """Segments of an image (H, W, 3) in their objects' colours, lit as in the image; else clear (H, W, 4)."""
     v, u = np.mgrid[: labels.shape[0], : labels.shape[1]]
     lit = (image @ np.array([0.299, 0.587, 0.114]))[..., None]
@@ -181,7 +164,7 @@ def _tint(image: NDArray[np.uint8], labels: NDArray[np.int32]) -> NDArray[np.uin
     return np.where(segment, np.dstack([colour, np.full(labels.shape, 255.0)]), 0.0).astype(np.uint8)
 
 
-def _window(labels: NDArray[np.int32]) -> tuple[int, int, int, int]:
+def window(labels: NDArray[np.int32]) -> tuple[int, int, int, int]:
     """Part of an image (H, W) that is shown (left, top, right, bottom) [px]: its segments and a third around.
 
     It has the image's proportions and is half as wide at least.
@@ -216,10 +199,12 @@ def draw_cloud(
     frame = _framed(cloud, graph, towards_eye, width)
     at, z = frame.project(cloud.points_world)
     pixels, projection = _splat(cloud, at, z, towards_eye, frame, max(1, round(point_size * frame.K[0, 0])))
-    strokes = _strokes(graph.objects, projection)
     tags = [projection.tag(o) for o in graph.objects if o.role != "support_surface" and o.id]
+    size = width, pixels.shape[0]
+    parts = [raster(pixels, 0.0, 0.0, *size), draw_shapes(graph.objects, projection)]
+    parts += draw_tags(tags, *size, 15.0)
     side = round(float(np.rad2deg(azimuth))) % 360
-    return draw_layers(f"the fused cloud with the fitted shapes, from {side}°", [pixels], strokes, tags)
+    return Picture(f"the fused cloud with the fitted shapes, from {side}°", *size, parts)
 
 
 def draw_solid(shape: Shape, label: int = 1) -> Picture:
@@ -303,35 +288,27 @@ def draw_stands(steps: Sequence[Step]) -> Picture:
     width, height = 480.0, 480.0 * float(np.clip((high - low)[1] / (high - low)[0], 0.6, 1.2))
     scale = float(((width, height) / (high - low)).min())
     above = _from_above(np.append((low + high) / 2.0, 0.0), scale, width, height)
-    strokes = _strokes(objects, above)
 
     def pixels(points: Array) -> Array:
         return above.project(np.column_stack([points[:, :2], np.zeros(len(points))]))[0]
 
-    def draw(axes: Axes) -> None:
-        from matplotlib.patches import Circle, Wedge
-
-        _put_strokes(axes, strokes)
-        for way in ways:
-            if len(way) > 1:
-                axes.plot(*pixels(way).T, color=VISITED, linewidth=1.6, zorder=6.0)
-        tags = []
-        for (number, robot), place in zip(held, places, strict=True):
-            platform, eye = pixels(place)
-            forward = robot.T_world_camera[:2, 2]
-            gaze = float(np.rad2deg(np.arctan2(-forward[1], forward[0])))
-            radius = scale * (0.08 if robot.arm else robot.footprint)
-            axes.add_patch(Circle(platform, radius, facecolor=VISITED + "1a", edgecolor=VISITED, zorder=5.9))
-            cone = Wedge(eye, 0.3 * scale, gaze - 30.0, gaze + 30.0, color=VISITED, alpha=0.35, zorder=6.0)
-            axes.add_patch(cone)
-            axes.plot(*platform, "o", markersize=6.0, color=VISITED, zorder=6.5)
-            x, y = (eye if robot.arm else platform).tolist()
-            tags.append(Tag(x, y - 15.0, str(number + 1), VISITED))
-        put_tags(axes, tags, 13.0)
-        axes.plot([12.0, 12.0 + 0.5 * scale], [height - 12.0] * 2, color=SOFT, linewidth=2.0)
-        axes.text(12.0, height - 18.0, "0.5 m", fontsize=11.0, color=SOFT)
-
-    return Picture("where the robot stood", width, height, draw)
+    parts = [draw_shapes(objects, above)]
+    parts += [line(pixels(way), VISITED, 1.6) for way in ways if len(way) > 1]
+    tags = []
+    for (number, robot), place in zip(held, places, strict=True):
+        platform, eye = pixels(place)
+        radius = scale * (0.08 if robot.arm else robot.footprint)
+        parts.append(dot(platform, radius, VISITED, fill_opacity=0.1, stroke=VISITED))
+        ahead = transforms.unit(robot.T_world_camera[:2, 2]) * (1.0, -1.0)
+        aside = 0.58 * ahead[::-1] * (-1.0, 1.0)  # 30° to each side
+        cone = eye + 0.27 * scale * np.array([(0.0, 0.0), ahead + aside, ahead - aside])
+        parts += [area(cone, VISITED, opacity=0.35), dot(platform, 3.0, VISITED)]
+        x, y = (eye if robot.arm else platform).tolist()
+        tags.append(Tag(x, y - 15.0, str(number + 1), VISITED))
+    parts += draw_tags(tags, width, height, 13.0)
+    parts.append(line(np.array([(12.0, height - 12.0), (12.0 + 0.5 * scale, height - 12.0)]), SOFT, 2.0))
+    parts.append(text(12.0, height - 22.0, "0.5 m", 11.0, SOFT, text_anchor="start"))
+    return Picture("where the robot stood", width, height, parts)
 
 
 def draw_sphere(step: Step) -> Picture:
@@ -348,46 +325,36 @@ def draw_sphere(step: Step) -> Picture:
         return above.project(centre + sphere.radius * np.reshape(directions, (-1, 3)))[0]
 
     saliency, dots = _painted(step)
-    strokes = _strokes(step.graph.objects, above)
     points = () if decision is None else sorted(decision.points_of_interest, key=lambda p: p.saliency)
     feet = above.project(np.reshape([p.position_world for p in points], (-1, 3)))[0]
-    rays = np.stack([feet, places(np.array([p.direction for p in points]))], axis=1)
-    look: dict[str, Any] = {"fontsize": 11.0, "color": SOFT, "ha": "center"}
-    rim: dict[str, Any] = {"markeredgecolor": DARK, "markeredgewidth": 1.0}
-
-    def draw(axes: Axes) -> None:
-        from matplotlib.collections import LineCollection
-        from matplotlib.patches import Circle
-
-        put_raster(axes, saliency, side / 2.0 - radius, side / 2.0 - radius, 2.0 * radius, 2.0 * radius)
-        _put_strokes(axes, strokes)
-        for name, elevation in (("y", 0.0), ("30°", 30.0), ("60°", 60.0)):
-            wide = radius * np.cos(np.deg2rad(elevation))
-            axes.add_patch(Circle((side / 2.0, side / 2.0), wide, fill=False, color=SOFT, linestyle=":"))
-            axes.text(side / 2.0, side / 2.0 - wide - 5.0, name, **look)
-        axes.text(side / 2.0 + radius + 10.0, side / 2.0 + 4.0, "x", **look)
-        axes.add_collection(LineCollection([*rays], colors=DARK, alpha=0.4, linewidths=1.0, zorder=5.5))
-        for point, ray in zip(points, rays, strict=True):
-            title = f"{' – '.join(point.subject)}: saliency {point.saliency:.2f}; {point.why}"
-            colour = colours.saliency_colour(point.saliency)
-            axes.plot(*ray[1], "o", markersize=8.0, color=colour, zorder=6.0, gid=f"point|{title}", **rim)
-        axes.plot(*places(dots).T, "o", markersize=6.4, color="white", zorder=6.5, **rim)
-        axes.plot(*places(step.visited).T, "o-", markersize=7.0, color=VISITED, linewidth=1.4, zorder=6.5)
-        tags = [
-            Tag(x, y - 15.0, str(k), VISITED) for k, (x, y) in enumerate(places(step.visited).tolist(), 1)
-        ]
-        if decision is not None:
-            ((x, y),) = places(sphere.direction_of(decision.T_world_camera)).tolist()
-            axes.plot(x, y, "o", markersize=14.0, color="white", zorder=6.5, **rim)
-            axes.plot(x, y, "o", markersize=7.0, color=DARK, zorder=6.6, gid="chosen|the next view")
-            tags.append(Tag(x, y - 20.0, "next", DARK))
-        put_tags(axes, tags, 13.0)
-        bar = colours.scale(np.tile(np.linspace(-1.0, 1.0, 150), (2, 1)), colours.SALIENCY_STOPS)
-        put_raster(axes, bar, side - 115.0, side - 15.0, 84.0, 8.0)
-        for left, text in ((-165.0, "saliency"), (-128.0, "−1"), (-18.0, "+1")):
-            axes.text(side + left, side - 7.0, text, **look)
-
-    return Picture(f"view sphere with its saliency after view {step.index + 1}", side, side, draw)
+    heads = places(np.array([p.direction for p in points]))
+    rim = {"stroke": DARK}
+    edge = side / 2.0 - radius
+    parts = [raster(saliency, edge, edge, 2.0 * radius, 2.0 * radius)]
+    parts.append(draw_shapes(step.graph.objects, above))
+    for name, elevation in (("y", 0.0), ("30°", 30.0), ("60°", 60.0)):
+        wide = radius * float(np.cos(np.deg2rad(elevation)))
+        parts.append(dot(np.full(2, side / 2.0), wide, "none", stroke=SOFT, stroke_dasharray="1 2"))
+        parts.append(text(side / 2.0, side / 2.0 - wide - 9.0, name, 11.0, SOFT))
+    parts.append(text(side - edge + 10.0, side / 2.0, "x", 11.0, SOFT))
+    parts += [line(np.stack(ends), DARK, 1.0, opacity=0.4) for ends in zip(feet, heads, strict=True)]
+    for point, head in zip(points, heads, strict=True):
+        title = f"{' – '.join(point.subject)}: saliency {point.saliency:.2f}; {point.why}"
+        parts.append(group([dot(head, 4.0, colours.saliency_colour(point.saliency), **rim)], "point", title))
+    parts += [dot(at, 3.2, "white", **rim) for at in places(dots)]
+    visited = places(step.visited)
+    parts += [line(visited, VISITED, 1.4), *(dot(at, 3.5, VISITED) for at in visited)]
+    tags = [Tag(x, y - 15.0, str(k), VISITED) for k, (x, y) in enumerate(visited.tolist(), 1)]
+    if decision is not None:
+        (at,) = places(sphere.direction_of(decision.T_world_camera))
+        parts.append(group([dot(at, 7.0, "white", **rim), dot(at, 3.5, DARK)], "chosen", "the next view"))
+        tags.append(Tag(at[0], at[1] - 20.0, "next", DARK))
+    parts += draw_tags(tags, side, side, 13.0)
+    bar = colours.scale(np.tile(np.linspace(-1.0, 1.0, 150), (2, 1)), colours.SALIENCY_STOPS)
+    parts.append(raster(bar, side - 115.0, side - 15.0, 84.0, 8.0))
+    for left, name in ((-165.0, "saliency"), (-128.0, "−1"), (-18.0, "+1")):
+        parts.append(text(side + left, side - 11.0, name, 11.0, SOFT))
+    return Picture(f"view sphere with its saliency after view {step.index + 1}", side, side, parts)
 
 
 def _painted(step: Step) -> tuple[NDArray[np.uint8], Array]:
@@ -428,32 +395,30 @@ def draw_chart(
         lines: Value after each view, 0 or more, by the name of each line.
         top: Upper end of the y axis; None = as high as the values.
     """
+    width, height = 480.0, 240.0
+    low, high = np.array([58.0, 168.0]), np.array([461.0, 34.0])  # corners of the axes
+    count = max(map(len, lines.values()))
+    most = top or float(np.nanmax([value for values in lines.values() for value in values], initial=1e-9))
+    steps = 10.0 ** np.floor(np.log10(most)) * np.array([0.1, 0.2, 0.5, 1.0, 2.0])
+    step = steps[np.argmax(most / steps <= 5.0)]
 
-    def draw(axes: Axes) -> None:
-        from matplotlib.ticker import MaxNLocator
+    def places(x: Any, y: Any) -> Array:
+        share = np.stack(np.broadcast_arrays((np.asarray(x) - 1.0) / max(count - 1, 1), np.divide(y, most)))
+        return (low[:, None] + (high - low)[:, None] * share).T
 
-        chart = axes.inset_axes((0.12, 0.3, 0.84, 0.56))
-        chart.spines[:].set_visible(False)
-        chart.grid(axis="y")
-        chart.xaxis.set_major_locator(MaxNLocator(10, integer=True))
-        chart.tick_params(labelsize=11.0, pad=6.0)
-        for k, (name, values) in enumerate(lines.items()):
-            form = ("o-", "s--", "D:", "^-.")[k]
-            look: dict[str, Any] = {"color": colours.PALETTE[k], "label": name, "zorder": 3.0 - 0.1 * k}
-            chart.plot(
-                range(1, len(values) + 1),
-                values,
-                form,
-                linewidth=2.0,
-                markersize=5.0 + 2.0 * k,
-                clip_on=False,
-                **look,
-            )
-        chart.set_xlim(1.0, max(len(values), 2))
-        chart.set_ylim(0.0, top)
-        chart.set_xlabel("view", fontsize=11.0)
-        chart.set_ylabel(y_name, fontsize=11.0)
-        chart.set_title(title, fontsize=12.0, fontweight="bold", loc="left", x=-0.12)
-        chart.legend(loc="upper left", bbox_to_anchor=(-0.14, -0.25), ncols=4, fontsize=11.0)
-
-    return Picture(title, 480.0, 240.0, draw)
+    parts = [text(8.0, 16.0, title, 12.0, INK, text_anchor="start", font_weight="bold")]
+    parts.append(text(260.0, 202.0, "view", 11.0, SOFT))
+    parts.append(text(12.0, 101.0, y_name, 11.0, SOFT, transform="rotate(-90 12 101)"))
+    for value in np.arange(0.0, most + 1e-6 * step, step):
+        ends = places([1.0, max(count, 2)], value)
+        parts += [line(ends, LINE, 1.0), text(50.0, ends[0, 1], f"{value:g}", 11.0, SOFT, text_anchor="end")]
+    for number in range(1, count + 1, -(-count // 10)):
+        parts.append(text(places(number, 0.0)[0, 0], 184.0, str(number), 11.0, SOFT))
+    for k, (name, values) in reversed([*enumerate(lines.items())]):
+        at, sample = places(np.arange(1, len(values) + 1), values), np.array([20.0 + 116.0 * k, 226.0])
+        for course, marked in ((at, at), (sample + [(-14.0, 0.0), (14.0, 0.0)], [sample])):
+            dashes = ("none", "8 4", "2 4", "8 3 2 3")[k]
+            parts.append(line(course, colours.PALETTE[k], 2.0, stroke_dasharray=dashes))
+            parts += [dot(p, 3.0 + k, colours.PALETTE[k]) for p in marked if np.isfinite(p).all()]
+        parts.append(text(sample[0] + 20.0, sample[1], name, 11.0, SOFT, text_anchor="start"))
+    return Picture(title, width, height, parts)

@@ -9,18 +9,17 @@ from __future__ import annotations
 from collections.abc import Collection, Hashable, Sequence
 from dataclasses import replace
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING, Any
+from xml.etree.ElementTree import Element
 
 import networkx as nx
 import numpy as np
+import shapely
 
+from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.viz.colours import ink_on, object_colour, object_stripes
-from caryatid.viz.pictures import DOUBT, INK, WRONG, Picture, keep_apart
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from caryatid.viz.pictures import DOUBT, INK, WRONG, Picture, area, group, keep_apart, line, text
 
 Place = tuple[float, float]
 """Across, in vertices' widths from the leftmost, and layer, 0 is the table's."""
@@ -153,17 +152,18 @@ def draw_graph(
     plates = np.array([[7.4 * len(word) + 4.0, 16.0] for word in words]).reshape(-1, 2)
     plates_at = keep_apart(np.reshape(notes, (-1, 2)), plates, np.array([width, height]))
 
-    def draw(axes: Axes) -> None:
-        for support, points, word, place in zip(graph.supports, edges, words, plates_at, strict=True):
-            line = _line_beside(points, plates_at, plates)
-            _put_edge(axes, support, line, word, place, marked=support.pair in marks)
-        for item in graph.objects:
-            at, half = corner + pitch * places[item.id], NODE / 2.0
-            if item.id == table:
-                at, half = np.array([width / 2.0, at[1] - 6.0]), np.array([width / 2.0 - 12.0, 14.0])
-            _put_node(axes, item, at, half, graph)
-
-    return Picture("support graph, from the support surface upwards", width, height, draw)
+    parts = []
+    for support, points, word, (x, y) in zip(graph.supports, edges, words, plates_at, strict=True):
+        colour = WRONG if support.pair in marks else DOUBT if support.doubtful else INK
+        thickness = max(1.4 if support.pair in marks else 0.6, 2.4 * support.belief)
+        parts.append(_edge(support, _course(points, plates_at, plates), colour, thickness))
+        parts.append(text(x, y, word, 12.0, colour))
+    for item in graph.objects:
+        at, half = corner + pitch * places[item.id], NODE / 2.0
+        if item.id == table:
+            at, half = np.array([width / 2.0, at[1] - 6.0]), np.array([width / 2.0 - 12.0, 14.0])
+        parts.append(_node(item, at, half, supported=item.id == table or bool(graph.supporters(item.id))))
+    return Picture("support graph, from the support surface upwards", width, height, parts)
 
 
 def _from_rim_to_rim(points: Array, support: Support, table: str | None) -> Array:
@@ -179,79 +179,61 @@ def _from_rim_to_rim(points: Array, support: Support, table: str | None) -> Arra
     return points
 
 
-def _line_beside(points: Array, centres: Array, sizes: Array) -> tuple[Array, Array]:
-    """A line that passes its points (N, 2) upright, with a gap at each note, as nothing is painted behind it.
+def _course(points: Array, centres: Array, sizes: Array) -> Array:
+    """The course (M, 2) of a line that passes points (N, 2) upright, with gaps (NaN) at all notes.
 
-    Args:
-        points: Where it passes [px].
-        centres: Centres (E, 2) of the notes of all edges [px].
-        sizes: Their widths and heights (E, 2) [px].
-
-    Returns:
-        The rest of the line (M, 2), and whether each of its points begins a new piece (M,).
+    Nothing is painted behind notes, whose centres and sizes are (E, 2) [px].
     """
     t = np.linspace(0.0, 1.0, 49)[:, None]
-    ease = np.hstack(
-        [t * t * (3.0 - 2.0 * t), t**3 + 1.5 * t * (1.0 - t)]
-    )  # a cubic Bézier, level in between
-    line = np.concatenate([points[:1], *(a + (b - a) * ease[1:] for a, b in pairwise(points))])
-    beside = np.any(np.abs(line[:, None] - centres) > sizes / 2.0, axis=2)
-    hidden = ~np.all(beside, axis=1)
-    shown = ~hidden & (np.linalg.norm(line - line[-1], axis=1) > 12.0)  # the head needs a straight end
-    shown[-1] = True
-    gaps = np.cumsum(hidden)[shown]
-    return line[shown], np.diff(gaps, prepend=-1) > 0
+    # A cubic Bézier, level in between.
+    ease = np.hstack([t * t * (3.0 - 2.0 * t), t**3 + 1.5 * t * (1.0 - t)])
+    course = np.concatenate([points[:1], *(a + (b - a) * ease[1:] for a, b in pairwise(points))])
+    hidden = np.any(np.all(np.abs(course[:, None] - centres) < sizes / 2.0, axis=2), axis=1)
+    return np.where(hidden[:, None], np.nan, course)
 
 
-def _put_edge(
-    axes: Axes, support: Support, line: tuple[Array, Array], word: str, place: Array, *, marked: bool
-) -> None:
-    """An arrow along a line, with its note."""
-    from matplotlib.patches import FancyArrowPatch
-    from matplotlib.path import Path
-
-    colour = WRONG if marked else DOUBT if support.doubtful else INK
-    solid = not support.doubtful
-    title = f"{support.supporter} supports {support.supported}: {support.why}".rstrip(": ")
+def _edge(support: Support, course: Array, colour: str, width: float) -> Element:
+    """An arrow along a course; its head needs a straight end."""
     kind = f"edge {support.supporter} {support.supported} {'doubtful' if support.doubtful else 'sure'}"
-    vertices, begins = line
-    curve = Path(vertices, np.where(begins, Path.MOVETO, Path.LINETO))
-    width = max(1.4 if marked else 0.6, 2.4 * support.belief)
-    arrow = FancyArrowPatch(
-        path=curve, arrowstyle="-|>,head_length=0.5,head_width=0.22", mutation_scale=20.0, color=colour,
-        linewidth=width, linestyle="-" if solid else (0, (3.5, 2.6)), gid=f"{kind}|{title}",
-    )  # fmt: skip
-    axes.add_artist(arrow)
-    axes.text(place[0], place[1], word, color=colour, fontsize=12.0, ha="center", va="center_baseline")
+    title = f"{support.supporter} supports {support.supported}: {support.why}".rstrip(": ")
+    tip = course[-1]
+    course = course[~(np.linalg.norm(course - tip, axis=1) < 12.0)]
+    along = transforms.unit(tip - course[~np.isnan(course[:, 0])][-1])
+    neck = tip - 10.0 * along
+    head = np.array([tip, neck + 4.4 * along[::-1] * (1.0, -1.0), neck + 4.4 * along[::-1] * (-1.0, 1.0)])
+    dashes = f"{3.5 * width:.3g} {2.6 * width:.3g}" if support.doubtful else "none"
+    shaft = line(np.vstack([course, neck]), colour, width, stroke_dasharray=dashes, stroke_linecap="butt")
+    return group([shaft, area(head, colour)], kind, title)
 
 
-def _put_node(axes: Axes, item: SceneObject, at: Array, half: Array, graph: SupportGraph) -> None:
-    """A vertex of half a width and height [px]; the table has no evidence and no supporter."""
+def _node(item: SceneObject, at: Array, half: Array, *, supported: bool) -> Element:
+    """A vertex of half a width and height [px]; the table has no evidence."""
     angle, table = np.linspace(0.0, np.pi, 24), item.role == "support_surface"
     outline = half * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+    inner = []
     if item.shape.kind == "cylinder":
         lid = half * np.stack([np.cos(angle), 0.25 * np.sin(angle)], axis=-1)
         middle = np.array([0.0, half[1] - 5.0])
         outline = np.concatenate([lid + middle, lid[::-1] * (1.0, -1.0) - middle])
-        axes.plot(*(at + lid - middle).T, color=INK, linewidth=1.2, zorder=3.5)
+        inner.append(line(at + lid - middle, INK, 1.2))
     elif item.shape.kind == "sphere":
         outline = half * np.stack([np.cos(2.0 * angle), np.sin(2.0 * angle)], axis=-1)
     elif item.shape.kind == "solid":  # a box without its corners
         outline = np.repeat(outline, 2, axis=0)
         outline[[1, 2, 5, 6], 0] *= 0.75
         outline[[0, 3, 4, 7], 1] *= 0.65
-    kind, rim = f"node {item.id}", {"edgecolor": INK, "linewidth": 1.2}
-    if not table and not graph.supporters(item.id):
+    rise = np.array([(-half[1], half[1]), (half[1], -half[1])])
+    for turn in object_stripes(item.label):
+        stripes = [rise * (turn, 1.0) + (x, 0.0) for x in np.arange(-80.0, 81.0, 10.0)]
+        seen = shapely.intersection(shapely.linestrings(stripes), shapely.polygons(outline))
+        inner += [line(at + s.coords, "#ffffff", 1.0, opacity=0.5) for s in seen if not s.is_empty]
+    colour, kind, rim = object_colour(item.label), f"node {item.id}", {"stroke": INK, "stroke_width": "1.2"}
+    if not supported:
         kind += " unsupported"
-        rim = {"edgecolor": DOUBT, "linewidth": 2.4, "linestyle": (0, (2.1, 1.5))}
-    colour = object_colour(item.label)
-    stripes = "".join({1: "//", -1: "\\\\"}[turn] for turn in object_stripes(item.label))
-    axes.fill(
-        *(outline + at).T, facecolor=colour, hatch=stripes or None, hatchcolor=(1, 1, 1, 0.5), zorder=3.0,
-        gid=f"{kind}|{item.id}: {item.shape.kind}", **rim,
-    )  # fmt: skip
-    text: dict[str, Any] = {"color": ink_on(colour), "ha": "center", "va": "center_baseline", "zorder": 4.0}
-    name, rise = (f"{item.id} · support surface", 0.0) if table else (item.id, 3.0)
-    axes.text(at[0], at[1] - rise, name, fontsize=13.0, fontweight="bold", **text)
+        rim = {"stroke": DOUBT, "stroke_width": "2.4", "stroke_dasharray": "5 3.6"}
+    name, lift = (f"{item.id} · support surface", 0.0) if table else (item.id, 4.0)
+    words = [text(at[0], at[1] - lift, name, 13.0, ink_on(colour), font_weight="bold")]
     if not table:
-        axes.text(at[0], at[1] + 11.0, f"{item.occurrences}/{item.opportunities}", fontsize=9.5, **text)
+        evidence = f"{item.occurrences}/{item.opportunities}"
+        words.append(text(at[0], at[1] + 10.0, evidence, 9.5, ink_on(colour)))
+    return group([area(at + outline, colour, **rim), *inner, *words], kind, f"{item.id}: {item.shape.kind}")

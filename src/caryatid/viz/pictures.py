@@ -1,152 +1,116 @@
-"""Pictures drawn with matplotlib for the report, its PDF, notebook cells and the docs.
+"""The model of a picture: SVG elements, which report, notebook cells, viewer and docs put into their pages.
 
-No display is needed, the user's own matplotlib settings have no effect, and the same picture gives the same
-bytes.
+The same picture gives the same bytes, and loads nothing.
 """
 
 from __future__ import annotations
 
 import base64
 import io
-import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from html import escape
-from itertools import count
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
+from xml.etree.ElementTree import Element, tostring
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from PIL import Image
 
 from caryatid.geometry.transforms import Array
 from caryatid.viz.colours import ink_on
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 THEME = {
     "ink": "#1d2126", "soft": "#5d666f", "line": "#dcdfe2", "doubt": "#b4480b", "wrong": "#c01048",
 }  # fmt: skip
 """Colours that a page may replace by its own, so that drawings can be read on light and dark."""
-INK, SOFT, LINE, DOUBT, WRONG = THEME.values()
-STYLE = {
-    "font.sans-serif": ["DejaVu Sans"],
-    "text.color": INK,
-    "text.parse_math": False,
-    "axes.axisbelow": True,
-    "axes.labelcolor": SOFT,
-    "grid.color": LINE,
-    "xtick.labelcolor": SOFT,
-    "ytick.labelcolor": SOFT,
-    "xtick.major.size": 0.0,
-    "ytick.major.size": 0.0,
-    "legend.frameon": False,
-    "legend.labelcolor": SOFT,
-    "path.simplify_threshold": 0.4,
-    "lines.solid_capstyle": "round",
-    "image.interpolation": "none",
-    "image.composite_image": False,
-    "svg.fonttype": "none",
-    "pdf.fonttype": 42,
-}
-"""matplotlib's settings that differ from its defaults."""
+INK, SOFT, LINE, DOUBT, WRONG = (f"var(--{name}, {colour})" for name, colour in THEME.items())
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Picture:
-    """A drawing that can be put into any matplotlib figure.
+    """A drawing.
 
     Attributes:
-        name: What it shows, for those who cannot see it; no two pictures of a page share a name.
+        name: What it shows, for those who cannot see it.
         width: Its natural width [px].
         height: Its natural height [px].
-        draw: Draws it into axes in pixels of that size, y down.
+        parts: Its SVG elements in pixels of that size, y down, the hindmost first.
     """
 
     name: str
     width: float
     height: float
-    draw: Callable[[Axes], None]
-
-    def put(self, figure: Any, where: tuple[float, float, float, float]) -> None:
-        """Draw it into a figure, lines and letters scaled with it: left, bottom, width, height [shares]."""
-        axes = figure.add_axes(where)
-        axes.set_axis_off()
-        axes.set(xlim=(0.0, self.width), ylim=(self.height, 0.0), autoscale_on=False)
-        self.draw(axes)
-        unit = where[2] * figure.get_size_inches()[0] * 72.0 / self.width
-        if unit == 1.0:
-            return
-        artists = [*axes.texts, *axes.lines, *axes.patches, *axes.collections]
-        for artist in (*artists, *(part for inset in axes.child_axes for part in inset.findobj())):
-            for size in ("fontsize", "linewidth", "markersize", "markeredgewidth", "mutation_scale"):
-                if hasattr(artist, f"set_{size}"):
-                    getattr(artist, f"set_{size}")(np.multiply(unit, getattr(artist, f"get_{size}")()))
-
-
-@contextmanager
-def own_style(salt: str = "caryatid") -> Iterator[None]:
-    """Draw with caryatid's settings of matplotlib, whatever the user's are."""
-    from matplotlib import style
-
-    with style.context(["default", STYLE | {"svg.hashsalt": salt}]):
-        yield
+    parts: Sequence[Element]
 
 
 def picture_svg(picture: Picture) -> str:
-    """Return a picture as an SVG element that stands inside an HTML page and loads nothing.
-
-    The colours of `THEME` become `var(--ink, …)` and so on. Groups drawn with a gid `class|title` get that
-    class and that tooltip; rasters get the classes `raster0`, `raster1`, …
-    """
-    numbers = count()
-
-    def raster(found: re.Match[str]) -> str:
-        """An image element with its PNG as WebP, several times smaller."""
-        content = io.BytesIO()
-        Image.open(io.BytesIO(base64.b64decode(found[1]))).save(content, "WEBP", quality=65, method=2)
-        data = base64.b64encode(content.getvalue()).decode("ascii")
-        form = f'class="raster{next(numbers)}" preserveAspectRatio="none"'
-        return f'<image {form} href="data:image/webp;base64,{data}"'
-
-    saved = _saved(picture, "svg", picture.name, transparent=True, metadata={"Date": None}).decode()
-    size = f"{picture.width:g} {picture.height:g}"
-    text = f'<svg viewBox="0 0 {size}" role="img" aria-label="{escape(picture.name)}">'
-    text += saved[saved.index("</metadata>") + len("</metadata>") :]
-    text = re.sub(r"<defs>\s*<style.*?</defs>", "", text, count=1, flags=re.DOTALL)
-    text = re.sub(r'<image xlink:href="data:image/png;base64,\s*([^"]*)" id="[^"]*"', raster, text)
-    text = re.sub(r"""<g id=(["'])([^|>]*?)\|(.*?)\1>""", r"<g class=\1\2\1><title>\3</title>", text)
-    text = re.sub(r'<g id="[^"]*"', "<g", text).replace("<title></title>", "")
-    text = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d)\d+", r"\1", path[0]), text)
-    text = re.sub(r">\s+<", "><", text.replace("xlink:href", "href"))
-    for variable, colour in THEME.items():
-        text = text.replace(colour, f"var(--{variable}, {colour})")
-    return text.strip()
+    """Return a picture as an SVG element that stands inside an HTML page."""
+    look = {"role": "img", "aria_label": picture.name, "font_family": "system-ui, DejaVu Sans, sans-serif"}
+    root = element("svg", viewBox=f"0 0 {picture.width:g} {picture.height:g}", **look)
+    root.extend(picture.parts)
+    return tostring(root, encoding="unicode")
 
 
-def picture_png(picture: Picture, **texts: str) -> bytes:
-    """Return a picture as the bytes of a PNG, with texts stored in it by their names."""
-    return _saved(picture, "png", dpi=72, metadata={"Software": None} | texts)
+# Elements
 
 
-def _saved(picture: Picture, kind: str, salt: str = "caryatid", **options: Any) -> bytes:
-    from matplotlib.figure import Figure
-
-    with own_style(salt):
-        figure = Figure(figsize=(picture.width / 72.0, picture.height / 72.0))
-        picture.put(figure, (0.0, 0.0, 1.0, 1.0))
-        content = io.BytesIO()
-        figure.savefig(content, format=kind, **options)
-    return content.getvalue()
+def element(tag: str, **look: Any) -> Element:
+    """An SVG element; `_` stands for the `-` in names of attributes."""
+    numbers = {name: value if isinstance(value, str) else f"{value:.4g}" for name, value in look.items()}
+    return Element(tag, {name.replace("_", "-"): value for name, value in numbers.items()})
 
 
-def put_raster(
-    axes: Axes, pixels: NDArray[np.uint8], left: float, top: float, width: float, height: float
-) -> None:
-    """Put pixels (H, W, C) into a picture's axes; the place is in pixels of the picture."""
-    axes.imshow(pixels, extent=(left, left + width, top + height, top), aspect="auto", clip_on=False)
+def group(parts: Iterable[Element], kind: str, title: str = "") -> Element:
+    """Elements of a class, with a tooltip."""
+    whole = element("g", **{"class": kind})
+    if title:
+        whole.append(element("title"))
+        whole[0].text = title
+    whole.extend(parts)
+    return whole
+
+
+def line(points: Array, colour: str, width: float, **look: Any) -> Element:
+    """A line through points (N, 2), interrupted where they are NaN."""
+    gaps = np.flatnonzero(np.isnan(points).any(axis=1))
+    pieces = [piece[~np.isnan(piece).any(axis=1)] for piece in np.split(points, gaps)]
+    shown = [shapely.simplify(shapely.linestrings(piece), 0.2) for piece in pieces if len(piece) > 1]
+    course = " ".join("M" + " ".join(f"{x:.1f},{y:.1f}" for x, y in piece.coords) for piece in shown)
+    known = {"fill": "none", "stroke_linecap": "round", "stroke_linejoin": "round"}
+    return element("path", d=course, stroke=colour, stroke_width=width, **(known | look))
+
+
+def area(corners: Array, colour: str, **look: Any) -> Element:
+    """A filled polygon with corners (N, 2)."""
+    return element("polygon", points=" ".join(f"{x:.1f},{y:.1f}" for x, y in corners), fill=colour, **look)
+
+
+def dot(at: Array, radius: float, colour: str, **look: Any) -> Element:
+    """A filled circle about a place (2,)."""
+    return element("circle", cx=float(at[0]), cy=float(at[1]), r=radius, fill=colour, **look)
+
+
+def text(x: float, y: float, words: str, size: float, colour: str, **look: Any) -> Element:
+    """Words, their middle at a place."""
+    known = {"text_anchor": "middle", "dominant_baseline": "central"}
+    written = element("text", x=x, y=y, font_size=size, fill=colour, **(known | look))
+    written.text = words
+    return written
+
+
+def raster(
+    pixels: NDArray[np.uint8], left: float, top: float, width: float, height: float, kind: str = "raster"
+) -> Element:
+    """Pixels (H, W, C), stretched to a place."""
+    content = io.BytesIO()
+    Image.fromarray(pixels).save(content, "WEBP", quality=65, method=2)
+    data = base64.b64encode(content.getvalue()).decode("ascii")
+    look = {"class": kind, "preserveAspectRatio": "none", "href": f"data:image/webp;base64,{data}"}
+    return element("image", x=left, y=top, width=width, height=height, **look)
+
+
+# Names
 
 
 class Tag(NamedTuple):
@@ -159,37 +123,28 @@ class Tag(NamedTuple):
     faint: bool = False
 
 
-def put_tags(axes: Axes, tags: Sequence[Tag], size: float) -> None:
-    """Write tags, moved until they cover neither each other nor the edge.
+def draw_tags(tags: Sequence[Tag], width: float, height: float, size: float) -> list[Element]:
+    """Draw tags, moved until they cover neither each other nor the edge of a picture.
 
-    Letters are `size` [px] high, or lower where the tags would otherwise fill more than a sixth of the axes;
-    below 6 px they could not be read and are left out.
+    Letters are `size` [px] high, or lower where the tags would otherwise fill more than a sixth of the
+    picture; below 6 px they could not be read and are left out.
     """
-    from matplotlib.collections import LineCollection
-
-    room = np.array([axes.get_xlim()[1], axes.get_ylim()[0]])
     anchors = np.array([tag[:2] for tag in tags]).reshape(-1, 2)
     plates = np.array([[0.62 * len(tag.text) + 1.0, 1.45] for tag in tags]).reshape(-1, 2)  # [letters]
-    size = min(size, float(np.sqrt(room.prod() / 6.0 / max(plates.prod(axis=1).sum(), 1.0))))
-    if size < 6.0 or not tags:
-        return
-    centres = keep_apart(anchors, size * plates + 2.0, room)
-    moved = np.hypot(*(anchors - centres).T) > 1.45 * size
-    half = np.maximum(0.5 * size * (plates[:, :1] - plates[:, 1:]), 0.1) * (1.0, 0.0)
-    pills = np.stack([centres - half, centres + half], axis=1)
-    alpha = [0.6 if tag.faint else 1.0 for tag in tags]
-    for lines, look in (
-        (np.stack([anchors, centres], axis=1)[moved], {"colors": "white", "linewidths": 1.4}),
-        (pills, {"colors": "white", "linewidths": 1.45 * size, "alpha": alpha}),
-        (pills, {"colors": [tag.colour for tag in tags], "linewidths": 1.3 * size, "alpha": alpha}),
-    ):
-        collection = LineCollection([*lines], capstyle="round", zorder=7.0, gid="shapes|", **look)
-        axes.add_collection(collection, autolim=False)
-    for tag, centre in zip(tags, centres, strict=True):
-        axes.text(
-            centre[0], centre[1], tag.text, color=ink_on(tag.colour), fontsize=size, fontweight="bold",
-            ha="center", va="center_baseline", zorder=8.0, gid="shapes|",
-        )  # fmt: skip
+    size = min(size, float(np.sqrt(width * height / 6.0 / max(plates.prod(axis=1).sum(), 1.0))))
+    if size < 6.0:
+        return []
+    plates *= size
+    parts = []
+    centres = keep_apart(anchors, plates + 2.0, np.array([width, height]))
+    for tag, anchor, centre, (wide, high) in zip(tags, anchors, centres, plates, strict=True):
+        if np.hypot(*(anchor - centre)) > high:
+            parts.append(line(np.stack([anchor, centre]), "white", 1.4))
+        left, top = centre - (wide / 2.0, high / 2.0)
+        look = {"fill": tag.colour, "stroke": "white", "opacity": "0.6" if tag.faint else "1"}
+        parts.append(element("rect", x=left, y=top, width=wide, height=high, rx=high / 2.0, **look))
+        parts.append(text(centre[0], centre[1], tag.text, size, ink_on(tag.colour), font_weight="bold"))
+    return [group(parts, "shapes")]
 
 
 def keep_apart(anchors: Array, sizes: Array, room: Array) -> Array:

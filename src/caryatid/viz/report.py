@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
+import io
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from caryatid.config import Config, ReportConfig
 from caryatid.geometry.transforms import Array
 from caryatid.graph import DOUBTFUL, SupportGraph
 from caryatid.manipulation.dismantling import Taken
-from caryatid.sensing.views import Cloud, View
+from caryatid.sensing.views import Cloud
 from caryatid.simulation.camera import intrinsics, render
 from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.world import SimulatedScene, posed
-from caryatid.viz.drawings import draw_chart, draw_cloud, draw_image, draw_layers, draw_sphere, draw_stands
+from caryatid.viz.drawings import draw_chart, draw_cloud, draw_image, draw_sphere, draw_stands, tint, window
 from caryatid.viz.graph_drawing import draw_graph
-from caryatid.viz.pictures import Picture, picture_png, picture_svg
-from caryatid.viz.scene_3d import scene_3d_html
+from caryatid.viz.pictures import Picture, picture_svg, raster
+from caryatid.viz.scene_3d import name_plate, scene_3d_html
 from caryatid.viz.tables import (
     Table,
     census,
@@ -216,21 +218,14 @@ def _answer(
     picture, caption = draw_graph(graph, truth.get("wrong", ()), truth.get("missing", ())), SUPPORTS
     if truth.get("wrong") or truth.get("missing"):
         caption += " Red: wrong or missing, compared with the ground truth."
-    wide = picture.width > WIDE
+    wide, azimuth = picture.width > WIDE, _first_azimuth(step)
     supports = Figure("Support graph", picture, caption, share=1 if wide else 2)
-    azimuth = _first_azimuth(step)
-    solid = draw_cloud(step.cloud, graph, azimuth)
-    still = "All points, with the fitted shapes."
+    solid, still = draw_cloud(step.cloud, graph, azimuth), "All points, with the fitted shapes."
     seen = Figure("Fused cloud", solid, still)
     if shown.view is not None:
         caption = f"View {shown.index + 1} with the final shapes; objects with pale names are not visible."
         seen = Figure("The objects", draw_image(shown.view, shown.labels, graph, width), caption)
-    figures = [supports, seen] if wide else [seen, supports]
-    if graph.objects:
-        caption = "Drag to rotate, scroll to zoom. Arrows are visible through objects; orange: doubtful."
-        heading, share, page = "In 3D" if wide else "", 2 if wide else 1, scene_3d_html(graph, azimuth)
-        figures.append(Figure(heading, solid, still, share, page=page, page_caption=caption))
-    yield Section("Answer", text, figures if wide else figures[:2], facts)
+    yield Section("Answer", text, [supports, seen] if wide else [seen, supports], facts)
     doubtful = doubts(graph)
     text = f"Nothing: all supports and objects have a probability above {DOUBTFUL}, and all shapes fit."
     if any(s.probability is None for s in graph.supports):
@@ -238,8 +233,11 @@ def _answer(
     elif doubtful:
         text = ""
     yield Section("What is doubtful", text, facts=doubtful)
-    if figures[2:] and not wide:
-        yield Section("In 3D", figures=figures[2:])
+    if graph.objects:
+        caption = "Drag to rotate, scroll to zoom. Arrows are visible through objects; orange: doubtful."
+        page = scene_3d_html(graph, azimuth)
+        figure = Figure("", solid, still, share=1, page=page, page_caption=caption)
+        yield Section("In 3D", figures=[figure])
 
 
 def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list[Figure]:
@@ -336,8 +334,8 @@ def _sphere_caption(step: Step) -> str:
 
 def draw_lift(
     scene: SimulatedScene, taken: Taken, graph: SupportGraph, T_world_camera: Array, config: Config
-) -> Figure:
-    """Draw a lift half way up, or at its end if it disturbed an object, in the objects' colours.
+) -> bytes:
+    """Draw a lift half way up, or at its end if it disturbed an object, as a PNG with heading and caption.
 
     Args:
         scene: The simulated scene.
@@ -346,35 +344,43 @@ def draw_lift(
         T_world_camera: Camera pose (4, 4) of the picture.
         config: Sizes of the picture.
     """
-    names, K = list(scene.object_bodies.values()), intrinsics(config.sensor)
     labels = {body: graph[i].label for i, body in taken.bodies.items()}
     label_of = np.zeros(max(scene.object_bodies) + 1, dtype=np.int32)
     for label, name in scene.object_bodies.items():
         label_of[label] = labels.get(name, 0)
+    names = list(scene.object_bodies.values())
     heights = taken.film[:, names.index(taken.body or "")][:, 2]
     rising = np.flatnonzero(heights < ASIDE / 2.0)
     state = taken.film[rising[(len(rising) - 1) // 2]] if taken.ok else taken.film[-1]
-    image = render(posed(scene, state), T_world_camera, K, config.sensor)
-    view = View(image.depth.astype(np.float32), K, rgb=image.rgb, name=f"lift of {taken.step.object_id}")
-    picture = draw_image(view, label_of[image.labels], graph, config.report.image_width // 2)
+    shot = render(posed(scene, state), T_world_camera, intrinsics(config.sensor), config.sensor)
+    found = label_of[shot.labels]
+    drawn, tinted = Image.fromarray(shot.rgb), Image.fromarray(tint(shot.rgb, found))
+    drawn.paste(tinted, mask=tinted)
+    for item in graph.objects:
+        v, u = np.nonzero(found == item.label)
+        if len(u) and item.role == "object":
+            plate = name_plate(item.id, item.label)
+            plate.thumbnail((64, 20))
+            drawn.paste(plate, (int(np.median(u)) - plate.width // 2, int(np.median(v)) - plate.height // 2))
+    drawn = drawn.crop(window(found))
+    drawn.thumbnail((config.report.image_width // 2,) * 2)
     held = f", {', '.join(taken.step.hold)} held" if taken.held else ""
     outcome = "Nothing else moved" if taken.ok else f"{', '.join(taken.disturbed)} moved"
-    return Figure(f"{taken.step.object_id}{held}", picture, f"{outcome}; {taken.step.why}.", 3)
+    said = PngInfo()
+    said.add_itxt("heading", f"{taken.step.object_id}{held}")
+    said.add_itxt("caption", f"{outcome}; {taken.step.why}.")
+    content = io.BytesIO()
+    drawn.save(content, "PNG", pnginfo=said)
+    return content.getvalue()
 
 
-def lift_picture(figure: Figure) -> bytes:
-    """The picture of a lift as a file of a run folder, with heading and caption in it."""
-    return picture_png(figure.picture, heading=figure.heading, caption=figure.caption)
-
-
-def read_lifts(folder: Path) -> list[Figure]:
-    """Read the pictures that `lift_picture` made, if any."""
-    figures = []
-    for path in sorted((folder / "lifts").glob("*.png")):
-        with Image.open(path) as image:
-            picture = draw_layers(f"lift {path.stem}", [np.asarray(image.convert("RGB"))])
-            figures.append(Figure(image.info.get("heading", ""), picture, image.info.get("caption", ""), 3))
-    return figures
+def read_lift(file: Path | BinaryIO) -> Figure:
+    """Read a picture that `draw_lift` drew."""
+    with Image.open(file) as image:
+        (width, height), info = image.size, image.info
+        pixels = raster(np.asarray(image.convert("RGB")), 0.0, 0.0, width, height)
+    picture = Picture(f"lift of {info.get('heading', '')}", width, height, [pixels])
+    return Figure(info.get("heading", ""), picture, info.get("caption", ""), 3)
 
 
 # As HTML
@@ -397,9 +403,4 @@ def template(name: str) -> jinja2.Template:
 
 def render_html(report: Report) -> str:
     """Write a report as one self-contained HTML file."""
-
-    def svg(section: Section, number: int, picture: Picture) -> str:
-        """A picture whose name, and so whose ids, no other picture of the page has."""
-        return picture_svg(replace(picture, name=f"{section.title}, {number}: {picture.name}"))
-
-    return template("page.html.jinja").render(report=report, svg=svg)
+    return template("page.html.jinja").render(report=report, svg=picture_svg)

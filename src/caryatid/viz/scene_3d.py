@@ -1,18 +1,25 @@
-"""The shapes and supports in 3D, as a page that needs nothing else: trimesh's own, with its three.js."""
+"""The model in 3D: as a scene for glTF, and as a page that needs nothing else, trimesh's own."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.sensing.view_sphere import direction
-from caryatid.viz.colours import ink_on, object_colour, rgb
-from caryatid.viz.pictures import DOUBT, INK
+from caryatid.viz.colours import Colour, ink_on, object_colour, rgb
+from caryatid.viz.pictures import THEME
+
+if TYPE_CHECKING:
+    import trimesh
+    from trimesh.visual import TextureVisuals
 
 LETTER = 0.024
 """Height of a name plate [m]."""
@@ -22,6 +29,34 @@ _CHECK = (
     "'This browser cannot show 3D: WebGL is missing or disabled.');}</script>"
 )
 """Says so in place of the shapes where the browser cannot draw them."""
+
+
+def make_scene(
+    graph: SupportGraph, look: Callable[[SceneObject], TextureVisuals], corners: int = 48
+) -> trimesh.Scene:
+    """Make the node `z_up`, and under it a node for the shape of each object, named by its id.
+
+    Args:
+        graph: The objects.
+        look: Returns the look of an object's mesh.
+        corners: Number of corners of circles.
+    """
+    import trimesh
+
+    # glTF has y up; the frame of the node `z_up` is caryatid's world.
+    T_file_world = [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
+    scene = trimesh.Scene(base_frame="file")
+    scene.graph.update(frame_from="file", frame_to="z_up", matrix=T_file_world)
+    for item in graph.objects:
+        mesh = item.shape.mesh(corners)
+        mesh.visual = look(item)
+        mesh.metadata = {"role": item.role, "shape": item.shape.kind, "size": item.shape.size}
+        _add(scene, item.id, mesh, item.shape.T_world_object)
+    return scene
+
+
+def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, T_world_mesh: Array | None = None) -> None:
+    scene.add_geometry(mesh, name, name, parent_node_name="z_up", transform=T_world_mesh)
 
 
 def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
@@ -37,35 +72,30 @@ def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
     import trimesh
     from trimesh.viewer.notebook import scene_to_html
 
-    scene = trimesh.Scene(base_frame="file")
-    # glTF has y up.
-    scene.graph.update("world", "file", matrix=[[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-
-    def add(name: str, mesh: Any, visual: Any = None, T_world_mesh: Array | None = None) -> None:
-        mesh.visual = visual or mesh.visual
-        scene.add_geometry(mesh, name, name, parent_node_name="world", transform=T_world_mesh)
-
     found = [item for item in graph.objects if item.role == "object"] or graph.objects
     points = np.concatenate([item.shape.outline() for item in found])
     low, high = points.min(axis=0), points.max(axis=0)
-    for item in graph.objects:
-        colour = rgb(object_colour(item.label))
-        if item.role == "support_surface":
-            # Only what is below the objects: the page turns all about the middle of what it shows.
-            x, y = high[:2] - low[:2] + 0.1
-            patch = trimesh.creation.box((x, y, 0.01))
-            top = item.centre_world[2] + float(item.shape.support(np.array([[0.0, 0.0, 1.0]]))[0])
-            at = transforms.rigid(np.eye(3), [*((low + high) / 2.0)[:2], top - 0.005])
-            add(item.id, patch, _material(colour, 255), at)
-            continue
-        add(item.id, item.shape.mesh(), _material(colour, 150), item.shape.T_world_object)
+
+    def shown(item: SceneObject) -> SceneObject:
+        """Of a surface, only what is below the objects: the page turns about the middle of all."""
+        if item.role == "object":
+            return item
+        top = item.centre_world[2] + float(item.shape.support(np.array([[0.0, 0.0, 1.0]]))[0])
+        at = transforms.rigid(np.eye(3), [*((low + high) / 2.0)[:2], top - 0.005])
+        return replace(item, shape=Box(at, np.array([*(high - low)[:2] + 0.1, 0.01])))
+
+    def look(item: SceneObject) -> TextureVisuals:
+        return _material(rgb(object_colour(item.label)), 150 if item.role == "object" else 255)
+
+    scene = make_scene(replace(graph, objects=tuple(map(shown, graph.objects))), look)
+    for item in found:
         for side, turn in (("front", 0.0), ("back", np.pi)):
-            add(f"name of {item.id}, {side}", *_plate(item, azimuth + turn))
+            _add(scene, f"name of {item.id}, {side}", *_plate(item, azimuth + turn))
     for number, support in enumerate(graph.supports):
-        look = _material(rgb(DOUBT if support.doubtful else INK), 255)
         arrow = _arrow(*support_ends(support, graph), 0.0035 * max(support.belief, 0.3))
         if arrow is not None:
-            add(f"support {number}", arrow, look)
+            arrow.visual = _material(rgb(THEME["doubt" if support.doubtful else "ink"]), 255)
+            _add(scene, f"support {number}", arrow)
     centre, reach = scene.bounds.mean(axis=0), float(np.ptp(scene.bounds, axis=0).max())
     forward = direction(azimuth, np.deg2rad(25.0))
     eye = centre + 1.9 * reach * np.array([forward[0], forward[2], -forward[1]])
@@ -87,7 +117,7 @@ def support_ends(support: Support, graph: SupportGraph) -> tuple[Array, Array]:
     return start, end
 
 
-def _material(colour: tuple[int, int, int], opacity: int) -> Any:
+def _material(colour: Colour, opacity: int) -> TextureVisuals:
     """A matt colour 0 … 255 of an opacity 0 … 255, a third of it without light; the page's lamp is strong."""
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
@@ -98,7 +128,7 @@ def _material(colour: tuple[int, int, int], opacity: int) -> Any:
     return TextureVisuals(material=PBRMaterial(baseColorFactor=[*lit, opacity], emissiveFactor=unlit, **look))
 
 
-def _arrow(start: Array, end: Array, radius: float) -> Any:
+def _arrow(start: Array, end: Array, radius: float) -> trimesh.Trimesh | None:
     """An arrow as a mesh, or None where it has no length."""
     import trimesh
 
@@ -124,8 +154,8 @@ def name_plate(name: str, label: int) -> Image.Image:
     return image
 
 
-def _plate(item: SceneObject, azimuth: float) -> tuple[Any, Any, Array]:
-    """A name plate before an object, its look and its pose (4, 4); it cannot be seen from behind."""
+def _plate(item: SceneObject, azimuth: float) -> tuple[trimesh.Trimesh, Array]:
+    """A name plate before an object, and its pose (4, 4); it cannot be seen from behind."""
     import trimesh
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
@@ -138,5 +168,5 @@ def _plate(item: SceneObject, azimuth: float) -> tuple[Any, Any, Array]:
     out, up = direction(azimuth, 0.0), np.array([0.0, 0.0, 1.0])
     before = item.centre_world + (float(item.shape.support(out[None])[0]) + 0.001) * out
     T_world_plate = transforms.rigid(np.column_stack([np.cross(up, out), up, out]), before)
-    plate = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
-    return plate, TextureVisuals(uv=uv, material=look), T_world_plate
+    visual = TextureVisuals(uv=uv, material=look)
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False), T_world_plate
