@@ -147,14 +147,6 @@ def test_a_run_is_not_replaced_where_it_holds_what_no_run_wrote(tmp_path):
     assert read_run(tmp_path / "RUN").record["seed"] == 1
 
 
-def test_a_run_that_does_not_list_its_files_is_kept_and_the_error_names_a_remedy(tmp_path):
-    write_run(tmp_path / "RUN", views=1, seed=1)
-    path = tmp_path / "RUN/run.json"
-    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "files"}))
-    with refusal(tmp_path / "RUN", "an earlier caryatid", "move or delete the folder"):
-        writer(tmp_path / "RUN")
-
-
 def test_what_a_killed_process_left_is_recovered_or_removed(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import json
 import platform
-import zipfile
+import re
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
@@ -25,6 +25,7 @@ from caryatid.graph import Change, Grasp, SupportGraph, TakeStep
 from caryatid.io import images
 from caryatid.io.graph_json import graph_text, read_graph
 from caryatid.io.json_files import json_text, parse_json, read_json
+from caryatid.io.packing import pack, unpack
 from caryatid.io.staging import StagedFolder, read_errors, recover
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
@@ -35,10 +36,16 @@ from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.support.relations import Effect, Removal
 
 FORMAT: Final = "caryatid/run"
+SESSION_FILE: Final = "session.jsonl"
+"""Log of a session."""
 AGAIN: Final = "run caryatid again"
 """Remedy for a broken file of a run."""
 PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
 """Packages whose versions run.json records."""
+OWN_FILES: Final = re.compile(
+    r"(run|graph)\.json|report\.html|lifts/\d+\.png|views/\d+/(graph\.json|view\.json|labels\.(png|npy)|step\.npz)"
+)
+"""Files of a run folder."""
 PARTS = (
     View, Cloud, ViewSphere, Candidates, Decision, PointOfInterest, Posture, RobotPose, Change, TakeStep,
     Grasp, Removal, Effect,
@@ -51,6 +58,8 @@ class RunWriter(StagedFolder):
 
     Ctrl-C also ends the block, and keeps the views so far. Any other error leaves nothing behind. An earlier
     run folder is replaced only at the end of the block. A folder with other files is never changed.
+
+    A run is what its run.json says, which is written last: what a kill leaves beside it does not count.
 
     Args:
         folder: RUN.
@@ -74,18 +83,13 @@ class RunWriter(StagedFolder):
     ) -> None:
         self._about = json.loads(json_text(dict(about) | {"settings": asdict(config)}))
         self.past = _unfinished(Path(folder), self._about) if stepwise else None
-        super().__init__(folder, replaces=_own_files, durable=stepwise, goes_on=self.past is not None)
+        super().__init__(folder, own=_own_files, published=self.past is not None)
+        record = {} if self.past is None else self.past.record
+        self.steps: list[dict[str, Any]] = [*record.get("steps", ())]
+        self._scores: list[Mapping[str, Any]] = [*record.get("scores", ())]
         self.more: dict[str, Any] = {}
         self.files: dict[str, bytes] = {}
         self._stepwise = stepwise
-        self.steps: list[dict[str, Any]] = []
-        self._graph = SupportGraph()
-        self._scores: list[Mapping[str, Any]] = []
-        if self.past is not None:
-            self.steps, self._graph = list(self.past.record["steps"]), self.past.graph
-            self._scores = list(self.past.record.get("scores", ()))
-            # Files listed for a view that a kill prevented may be missing.
-            self.written |= {name for name in self.past.record["files"] if (self._place / name).exists()}
 
     def add(self, step: Step, score: Mapping[str, Any] | None = None) -> None:
         """Write the next view, or the newest one again with its `stop`.
@@ -101,22 +105,23 @@ class RunWriter(StagedFolder):
         """
         if step.stop is not None and self.steps and self.steps[-1]["view"] == step.index:
             del self.steps[-1], self._scores[len(self.steps) :]
-        number = len(self.steps)
-        labels, folder = step.labels, _view_folder(number)
+        number, labels = len(self.steps), step.labels
         if labels.size and not 0 <= labels.min() <= labels.max() <= SUPPORT_LABEL:
             reason = f"labels are not all within 0…{SUPPORT_LABEL}"
             raise InputError(step.name, reason, "number objects from 1, 0 = no object")
-        self.write(f"{folder}/graph.json", graph_text(step.graph).encode())
-        if labels.ndim == 2:
-            self.write(f"{folder}/labels.png", images.png(labels.astype(np.uint16)))
-        else:
-            self.write(f"{folder}/labels.npy", images.npy(labels.astype(np.int32)))
+        self.files["graph.json"] = graph_text(step.graph).encode()
         document = {"view": number, "name": step.name} | _summary(step)
-        self.write(f"{folder}/view.json", json_text(document).encode())
-        self.write(f"{folder}/step.npz", _encoded(step))
+        stored = _with_cloud(step, np.float32)
+        parts = {f.name: getattr(stored, f.name) for f in fields(stored) if f.name != "graph"}
+        files = {"view.json": json_text(document).encode(), "step.npz": pack(parts)}
+        if labels.ndim == 2:
+            files["labels.png"] = images.png(labels.astype(np.uint16))
+        else:
+            files["labels.npy"] = images.npy(labels.astype(np.int32))
+        for name, content in ({"graph.json": self.files["graph.json"]} | files).items():
+            self.write(f"{_view_folder(number)}/{name}", content)
         names = ("timings", "angle_travelled", "path_travelled", "stop")
         self.steps.append({"view": step.index} | {name: getattr(step, name) for name in names})
-        self._graph = step.graph
         self._scores += [] if score is None else [score]
         if self._stepwise:
             self._finish({"unfinished": True} if step.decision is not None else {})
@@ -137,24 +142,18 @@ class RunWriter(StagedFolder):
             raise KeyboardInterrupt(f"{count} kept in {self.folder}; {remedy}") from None
 
     def _finish(self, more: dict[str, Any]) -> None:
-        """Write the files of the whole run, and publish the folder."""
-        count = len(self.steps)
-        document = {"format": FORMAT, "version": 2, "views": count} | self._about
+        """Write the files of the whole run, run.json last, and publish the folder."""
+        document = {"format": FORMAT, "version": 2, "views": len(self.steps)} | self._about
         document["date"] = datetime.now(UTC).isoformat(timespec="seconds")
         document["versions"] = {"python": platform.python_version()} | {p: version(p) for p in PACKAGES}
         document |= {name: self.steps[-1][name] for name in ("angle_travelled", "path_travelled")}
         document["steps"] = self.steps
         document |= ({"scores": self._scores} if self._scores else {}) | self.more | more
-        self.remove(_view_folder(count))
-        for path, content in ({"graph.json": graph_text(self._graph).encode()} | self.files).items():
+        shutil.rmtree(self._partial / _view_folder(len(self.steps)), ignore_errors=True)  # of Ctrl-C
+        self.files["run.json"] = json_text(document).encode()
+        for path, content in self.files.items():
             self.write(path, content)
         self.files = {}
-        # A kill may leave files of the next view, to which nothing refers.
-        files = self.written
-        if "unfinished" in more:
-            names = ("graph.json", "labels.png", "view.json", "step.npz")
-            files = files | {lift_file(count)} | {f"{_view_folder(count)}/{name}" for name in names}
-        self.write("run.json", json_text(document | {"files": sorted(files)}).encode())
         self.publish()
 
 
@@ -296,8 +295,8 @@ def is_run(folder: Path) -> bool:
 
 
 def is_session(folder: Path) -> bool:
-    """Whether a folder is a session, which other commands than `caryatid session` read as a run."""
-    return (folder / "session.json").is_file()
+    """Whether a folder is a session, perhaps of an earlier release; other commands read it as a run."""
+    return any((folder / name).is_file() for name in (SESSION_FILE, "session.json"))
 
 
 def _exists(folder: Path) -> bool:
@@ -307,15 +306,9 @@ def _exists(folder: Path) -> bool:
     return folder.is_dir()
 
 
-def _own_files(folder: Path) -> set[str]:
-    """Files of a run folder that may be replaced: those that run.json lists, and those made from them."""
-    if not is_run(folder):
-        return set()
-    files = read_json(folder / "run.json").get("files")
-    if files is None:
-        reason = "contains a run of an earlier caryatid, which does not list its files"
-        raise InputError(folder, reason, "move or delete the folder, or give a new one")
-    return {"run.json", "report.html", *map(str, files)}
+def _own_files(folder: Path) -> re.Pattern[str] | None:
+    """The files of a run folder that may be replaced."""
+    return OWN_FILES if is_run(folder) else None
 
 
 def _unfinished(folder: Path, about: Mapping[str, Any]) -> Run | None:
@@ -367,70 +360,16 @@ def _summary(step: Step) -> dict[str, Any]:
     return record
 
 
-def _encoded(step: Step) -> bytes:
-    """Content of step.npz: a step as JSON in the member `document`, and each larger array as a member."""
-    arrays: dict[str, NDArray[Any]] = {}
-
-    def encoded(value: Any, path: str) -> Any:
-        match value:
-            case np.ndarray() if 0 < value.size <= 16 and value.dtype == np.float64:
-                return {"$array": value.tolist()}
-            case np.ndarray():
-                arrays[path] = value
-                return {"$array": path}
-            case np.generic():
-                return value.item()
-            case Mapping():
-                return {key: encoded(item, f"{path}.{key}") for key, item in value.items()}
-            case tuple():
-                return [encoded(item, f"{path}.{number}") for number, item in enumerate(value)]
-        if isinstance(value, PARTS):
-            members = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
-            return {"$kind": type(value).__name__} | encoded(members, path)
-        return value
-
-    step = _with_cloud(step, np.float32)
-    names = [f.name for f in fields(step) if f.name != "graph"]
-    document = json.dumps({name: encoded(getattr(step, name), name) for name in names})
-    arrays["document"] = np.frombuffer(document.encode(), dtype=np.uint8)
-    buffer = io.BytesIO()
-    # Higher levels of compression take longer and save little.
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
-    return buffer.getvalue()
-
-
 def _read_step(folder: Path) -> Step:
     """The step in a folder `views/NN`."""
     path, remedy = folder / "step.npz", "explore again"
     with read_errors(path, remedy):
         content = path.read_bytes()
     try:
-        arrays = dict(np.load(io.BytesIO(content), allow_pickle=False))
-        document = json.loads(arrays.pop("document").tobytes())
-        step = Step(**_decoded(document, arrays), graph=read_graph(folder / "graph.json"))
+        step = Step(**unpack(content, PARTS), graph=read_graph(folder / "graph.json"))
         return _with_cloud(step, np.float64)
     except Exception as error:  # a damaged archive raises almost anything
         raise InputError(path, f"not a step of a run ({' '.join(str(error).split())})", remedy) from error
-
-
-def _decoded(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
-    """Rebuild what `_encoded` wrote."""
-    match value:
-        case {"$array": str(name)}:
-            return arrays[name]
-        case {"$array": numbers}:
-            return np.array(numbers)
-        case {"$kind": kind, **members}:
-            (part,) = (part for part in PARTS if part.__name__ == kind)
-            return part(**_decoded(members, arrays))
-        case dict():
-            return {key: _decoded(item, arrays) for key, item in value.items()}
-        case list():
-            return tuple(_decoded(item, arrays) for item in value)
-    return value
 
 
 def _with_cloud(step: Step, dtype: type[np.floating[Any]]) -> Step:
