@@ -42,12 +42,14 @@ from caryatid.graph import Change
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import read_mask
 from caryatid.io.json_files import Numbers
+from caryatid.io.log import BusyError
 from caryatid.manipulation.order import plan_order
 from caryatid.runtime.parallel import cores
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.captures import CameraRecord
 from caryatid.sessions.next_view import CandidateViews
 from caryatid.sessions.session import Added, SessionConflictError
+from caryatid.steps import is_session
 
 
 class FullError(CaryatidError):
@@ -61,6 +63,7 @@ class MissingError(CaryatidError):
 STATUS: dict[type[Exception], int] = {
     MissingError: 404,
     SessionConflictError: 409,
+    BusyError: 409,
     PlanningError: 409,
     FullError: 503,
     OSError: 503,
@@ -297,7 +300,7 @@ class SessionPool:
 
     def names(self) -> list[str]:
         """Names of all sessions."""
-        return sorted(path.parent.name for path in self.folder.glob("*/session.json"))
+        return sorted(path.name for path in self.folder.glob("*") if is_session(path))
 
     def begin(self, name: str, config: Config, **options: Any) -> Session:
         """Create a session; the options are those of `Session.begin`.
@@ -319,11 +322,11 @@ class SessionPool:
 
         Raises:
             MissingError: No session has this name.
-            SessionBusyError: Another process has it open.
+            BusyError: Another process has it open.
         """
         if name in self._open:
             return self._opened(name, self._open.pop(name))
-        if not (self.folder / name / "session.json").is_file():
+        if not is_session(self.folder / name):
             raise MissingError(f"unknown session '{name}'; create it first")
         return self._opened(name, Session.open(self.folder / name))
 

@@ -87,7 +87,7 @@ class Log:
             InputError: The disk cannot be written.
         """
         assert self.writable, "this log was opened for reading"
-        line = json.dumps(document, ensure_ascii=False).encode() + b"\n"
+        line = json.dumps(document).encode() + b"\n"
         with write_errors(self.path):
             self._file.truncate(self._size)
             try:
