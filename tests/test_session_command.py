@@ -13,7 +13,7 @@ from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.scene import Scene
 from caryatid.sessions import Capture, Session
-from caryatid.sessions.reading import open_run
+from caryatid.sources import open_run
 from caryatid.steps import read_steps
 
 

@@ -89,7 +89,7 @@ class Evaluate(options.Command):
     def __call__(self) -> None:
         from caryatid.cli.output import table
         from caryatid.evaluation.truths import evaluate_run
-        from caryatid.sessions.reading import open_run
+        from caryatid.sources import open_run
 
         output = self.output
         with open_run(self.run) as run:
@@ -132,7 +132,7 @@ class OrderCommand(options.LiftingCommand, options.ComputingCommand):
         from caryatid.cli.output import table
         from caryatid.manipulation.order import plan_order
         from caryatid.runtime.parallel import cores
-        from caryatid.sessions.reading import read_model
+        from caryatid.sources import read_model
         from caryatid.viz.tables import order_line, order_table
 
         config = self.settings.read(self.lift_settings())
@@ -192,7 +192,7 @@ class Export(options.Command):
 
     def __call__(self) -> None:
         from caryatid.exports import export_graph, format_of
-        from caryatid.sessions.reading import read_model
+        from caryatid.sources import read_model
         from caryatid.viz.tables import census
 
         config, format_ = self.settings.read(), format_of(self.out, self.format)
@@ -210,7 +210,7 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
             an existing report.html then remains unchanged.
     """
     from caryatid.io.staging import write_file
-    from caryatid.sessions.reading import open_run
+    from caryatid.sources import open_run
     from caryatid.steps import read_config, read_steps
     from caryatid.viz.pdf import render_pdf
     from caryatid.viz.report import make_report, read_lifts, render_html

@@ -176,11 +176,10 @@ class View(options.ExploringCommand):
     """Print the address of the page, but do not open a browser."""
 
     def __call__(self) -> None:
-        from caryatid.sources import is_name
-        from caryatid.steps import is_run, is_session
+        from caryatid.sources import kind_of
 
         config, output, path = self.config(), self.output, Path(self.source)
-        finished = not is_name(self.source) and (is_run(path) or is_session(path))
+        finished = kind_of(self.source) in ("run", "session")
         # The page shares the interpreter with the loop: a tenth of Python's interval lets it answer at once.
         sys.setswitchinterval(0.0005)
         with closing(self._open_run(path) if finished else self._open_loop(config)) as page:
@@ -193,7 +192,7 @@ class View(options.ExploringCommand):
 
     def _open_run(self, folder: Path) -> Page:
         from caryatid.evaluation.truths import evaluate_run
-        from caryatid.sessions.reading import open_run
+        from caryatid.sources import open_run
         from caryatid.steps import read_config, read_steps
         from caryatid.viewer.page import Page
 
@@ -419,9 +418,9 @@ def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]
 
 def _conditions(command: RunCommand | Clear) -> str:
     """Source of the segments, and noise of a simulation."""
-    from caryatid.sources import is_cloud, is_recording
+    from caryatid.sources import kind_of
 
-    simulated = not is_cloud(command.source) and not is_recording(command.source)
+    simulated = kind_of(command.source) == "scene"
     masks = command.settings.masks_from or ("simulator" if simulated else "from the source, if any")
     automatic = getattr(command, "segmentation", None) == "auto"
     text = "segments: automatic" if automatic else f"masks: {masks}"

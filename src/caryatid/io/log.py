@@ -5,14 +5,18 @@ from __future__ import annotations
 import errno
 import json
 import os
+from base64 import b64encode
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from filelock import FileLock, Timeout
 
 from caryatid.errors import InputError
 from caryatid.io.staging import read_errors, sync, write_errors
+
+LATER: Final = "delete this line and all later ones"
+"""Remedy for a damaged line."""
 
 
 class BusyError(InputError):
@@ -76,18 +80,20 @@ class Log:
                     if number == 1:
                         raise InputError(self.path, f"is not a {self._what}", "choose another folder")
                     reason = f"line {number} is damaged"
-                    raise InputError(self.path, reason, "delete this line and all later ones")
+                    raise InputError(self.path, reason, LATER)
                 if whole:
                     yield document
 
     def append(self, document: Mapping[str, Any]) -> None:
         """Append an object; when this returns, it is on disk. After an error, the log is as before.
 
+        Arrays become lists, bytes base64.
+
         Raises:
             InputError: The disk cannot be written.
         """
         assert self.writable, "this log was opened for reading"
-        line = json.dumps(document).encode() + b"\n"
+        line = json.dumps(document, default=_plain).encode() + b"\n"
         with write_errors(self.path):
             self._file.truncate(self._size)
             try:
@@ -107,3 +113,7 @@ class Log:
             self.writable = False
             self._file.close()
             self._lock.release()
+
+
+def _plain(value: Any) -> Any:
+    return b64encode(value).decode() if isinstance(value, bytes) else value.tolist()

@@ -12,18 +12,16 @@ from __future__ import annotations
 import gzip
 import hashlib
 import io
-import json
 import logging
 import pickle
 import threading
-from base64 import b64encode
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from annotated_types import Ge
@@ -45,7 +43,7 @@ from caryatid.graph import Change, SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.images import png, read_mask
 from caryatid.io.json_files import Numbers, parse_json
-from caryatid.io.log import Log
+from caryatid.io.log import LATER, Log
 from caryatid.io.packing import pack, unpack
 from caryatid.io.staging import read_errors, recover, sync, write_errors, write_file
 from caryatid.planning.decision import PlanningState
@@ -65,8 +63,6 @@ NO_SESSION: Final = "not a session", "create one with `caryatid session new`"
 """Reason and remedy for another folder."""
 RESTORE: Final = "restore this file, or delete this view and all later lines from the log"
 """Remedy for a damaged view."""
-DELETE: Final = "delete this line and all later ones"
-"""Remedy for a damaged line."""
 ANOTHER_RELEASE: Final = "open it with that release, or add its views to a new session"
 """Remedy for a session of another release."""
 SNAPSHOTS: Final = 8
@@ -168,56 +164,22 @@ class Moved:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Report:
-    """An object that the robot removed or moved.
-
-    Attributes:
-        object: Id of the object.
-        T: The object's motion as a rigid transform (4, 4) in the world frame, or None if it was removed.
-    """
-
-    object: str
-    T: Annotated[Array, Numbers(4, 4, rigid=True)] | None = None
-
-    def apply(self, scene: Scene) -> None:
-        """Apply the report to a scene.
-
-        Raises:
-            InputError: The scene does not have the object.
-        """
-        if self.T is None:
-            scene.removed(self.object)
-        else:
-            scene.moved(self.object, self.T)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Stored:
-    """A view of a session.
-
-    Attributes:
-        name: Its name.
-        digest: Digest of its file.
-        T_world_camera: Its camera pose (4, 4), or None.
-    """
-
-    name: str
-    digest: str
-    T_world_camera: Annotated[Array, Numbers(4, 4, rigid=True)] | None = None
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class Event:
-    """A line of a session: a view, a report, or what takes the last of them back."""
+    """A line after the first.
 
-    view: Stored | None = None
-    report: Report | None = None
-    undo: bool = False
+    Attributes:
+        kind: A view, a report that the robot removed or moved an object, or undo of the event before.
+        name: Name of the view, or id of the object.
+        number: Number of the view, which names its file.
+        digest: Digest of this file.
+        T: Camera pose (4, 4) of the view, if given; or motion (4, 4) of the object, if it was not removed.
+    """
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the line."""
-        line: dict[str, Any] = json.loads(json.dumps(asdict(self), default=np.ndarray.tolist))
-        return {name: value for name, value in line.items() if value}
+    kind: Literal["view", "report", "undo"]
+    name: str = ""
+    number: Annotated[int, Ge(0)] = 0
+    digest: str = ""
+    T: Annotated[Array, Numbers(4, 4, rigid=True)] | None = None
 
 
 class Session:
@@ -241,19 +203,17 @@ class Session:
             self.beginning = Beginning.read(next(lines, None), log.path)
             self._events: list[Event] = []
             for number, line in enumerate(lines, start=2):
-                event = parse_json(Event, line, f"{log.path}: line {number}", DELETE)
-                if event.undo:
+                event = parse_json(Event, line, f"{log.path}: line {number}", LATER)
+                if event.kind == "undo":
                     del self._events[-1:]
-                elif event.view or event.report:
-                    self._events.append(event)
                 else:
-                    raise InputError(log.path, f"line {number} is neither a view nor a report", DELETE)
+                    self._events.append(event)
             mask = self.beginning.ignore
             most, name = self.beginning.settings.recording.max_pixels, f"{log.path}: ignore"
             self._ignored = None if mask is None else read_mask(mask, name, most)
             if log.writable:
                 recover(path)
-            self._first = self._view(0) if self.views else None
+            self._first = self._read_view(self._views[0]) if self._views else None
             self.scene = self._after(self._events)
             failure.pop_all()
         waiting = self.scene.waiting
@@ -293,7 +253,7 @@ class Session:
         mask = None if ignore is None else png(np.asarray(ignore, dtype=np.uint8))
         Scene(config, segmentation=segmentation, seed=seed)  # refuse what a scene refuses
         beginning = Beginning(segmentation, int(seed), planner, robot, config or Config(), mask)
-        folder, more = Path(path), FORMAT | {"caryatid": version("caryatid")}
+        folder = Path(path)
         with write_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
             sync(folder.resolve().parent)
@@ -306,8 +266,7 @@ class Session:
             log = failure.enter_context(Log(file, "session", write=True))
             if any(log):
                 raise SessionConflictError(folder, *conflict)
-            document = json.dumps(more | asdict(beginning), default=lambda image: b64encode(image).decode())
-            log.append(json.loads(document))
+            log.append(FORMAT | {"caryatid": version("caryatid")} | asdict(beginning))
             failure.pop_all()
             return cls(folder, log)
 
@@ -344,9 +303,13 @@ class Session:
         self._log.close()
 
     @property
+    def _views(self) -> list[Event]:
+        return [event for event in self._events if event.kind == "view"]
+
+    @property
     def views(self) -> int:
         """Number of views."""
-        return sum(event.view is not None for event in self._events)
+        return len(self._views)
 
     @property
     def reports(self) -> int:
@@ -376,11 +339,10 @@ class Session:
             view = view.decode(self.beginning.settings.recording.max_pixels)
         view = view if self._ignored is None else replace(view, ignored=self._ignored)
         content = pack(replace(view, name=""))
-        name = view.name.encode(errors="replace").decode()  # of a file, it may not be text
-        stored = Stored(name, hashlib.sha256(content).hexdigest(), view.T_world_camera)
+        name = view.name.encode(errors="replace").decode()  # that of a file may not be text
+        event = Event("view", name, self.views, hashlib.sha256(content).hexdigest(), view.T_world_camera)
         if number is not None and number != self.views:
-            newest = next((e.view for e in reversed(self._events) if e.view), None)
-            if number != self.views - 1 or newest is None or newest.digest != stored.digest:
+            if not 0 <= number == self.views - 1 or event.digest != self._views[-1].digest:
                 reason = f"has number {number}, but the next view is {self.views}"
                 raise SessionConflictError(view.name, reason)
             return self._added()
@@ -388,12 +350,12 @@ class Session:
         scene = self.scene.copy()
         with _collected_warnings() as warnings:
             graph_text(scene.update(view))  # reject a view whose graph cannot be written
-        path = self._file(self.views)
+        path = self._file(event)
         with write_errors(self.path):
             path.parent.mkdir(exist_ok=True)
             sync(self.path)
         write_file(path, content, durable=True)
-        self._keep(Event(view=stored), scene)
+        self._keep(event, scene)
         self._first = self._first or view
         self._warnings = warnings
         return self._added()
@@ -415,23 +377,21 @@ class Session:
             InputError: The object is unknown, or T is not a rigid transform; the session does not change.
         """
         self._check_writable()
-        event = Event(report=Report(object_id, None if T is None else as_rigid(T, "T")))
+        event = Event("report", object_id, T=None if T is None else as_rigid(T, "T"))
         if number is not None and number != self.reports:
-            newest = self._events[-1] if 0 <= number == self.reports - 1 else None
-            if newest is None or newest.to_json() != event.to_json():
+            if not 0 <= number == self.reports - 1 or _told(self._events[-1]) != _told(event):
                 reason = f"has number {number}, but the next report is {self.reports}"
                 raise SessionConflictError("report", reason)
             return self.graph
         scene = self.scene.copy()
-        assert event.report is not None
-        event.report.apply(scene)
+        self._apply(event, scene)
         graph_text(scene.graph)
         self._keep(event, scene)
         return self.graph
 
     def _keep(self, event: Event, scene: Scene) -> None:
         """Log an event, and continue with the scene after it."""
-        self._log.append(event.to_json())
+        self._log.append(asdict(event))
         self._events.append(event)
         self.scene = scene
         self._write_snapshot(scene, self._events)
@@ -458,8 +418,8 @@ class Session:
         sphere, robot = self.scene.sphere, None
         if sphere is None:
             raise PlanningError("no view shows a table top yet; add one that does")
-        poses = [event.view.T_world_camera for event in self._events if event.view]
-        T_world_cameras = np.stack([self.scene.T_world_cameras[0] if T is None else T for T in poses])
+        first = self.scene.T_world_cameras[0]
+        T_world_cameras = np.stack([first if event.T is None else event.T for event in self._views])
         if candidates is not None:
             reachable = given_candidates(candidates, path_length, T_world_cameras[-1], sphere)
         else:
@@ -478,7 +438,7 @@ class Session:
         state = PlanningState(
             self.scene.graph, sphere, self.scene.voxels, visited, reachable, self.scene.config.active
         )
-        reports = [number for number, event in enumerate(self._events, start=1) if event.report]
+        reports = [number for number, event in enumerate(self._events, start=1) if event.kind == "report"]
         stop = used_up(len(self._events) - max(reports, default=0), state.config)
         stop = stop or reason_to_stop(state, self.scene.changed, planner, decision)
         return NextView(self.views, decision, stop)
@@ -489,19 +449,18 @@ class Session:
         Raises:
             InputError: No view shows a support surface, or a view is broken.
         """
-        b, number, newest = self.beginning, 0, None
+        b, newest = self.beginning, None
         explorer = Explorer(config=b.settings, segmentation=b.segmentation, seed=b.seed)
         scene = explorer.scene
         for event in self._events:
-            if event.report:
-                event.report.apply(scene)
+            if event.kind == "report":
+                self._apply(event, scene)
                 continue
             with suppress(NoSurfaceError):  # the view is kept until a later one shows the surface
-                for step in explorer.looks(self._view(number)):
+                for step in explorer.looks(self._read_view(event)):
                     if newest is not None:
                         yield newest
                     newest = step
-            number += 1
         if newest is None:
             raise InputError(self.path, "no view shows a table top yet", "add one that does")
         reported = "; ".join(str(change) for change in scene.changes if change.view == scene.views)
@@ -522,7 +481,7 @@ class Session:
             raise SessionConflictError(self.path, "has nothing to undo", "add a view first")
         left = self._events[:-1]
         scene = self._after(left)
-        self._log.append(Event(undo=True).to_json())
+        self._log.append(asdict(Event("undo")))
         self._events, self.scene, self._warnings = left, scene, []
         self._first = self._first if self.views else None
         return self.views
@@ -549,37 +508,40 @@ class Session:
             reason = f"its camera has {described(view)}, but that of earlier views has {described(first)}"
             raise InputError(view.name, reason, "use the same camera, or create a new session")
 
-    def _file(self, number: int) -> Path:
-        return self.path / f"views/{number:06d}.npz"
+    def _file(self, event: Event) -> Path:
+        return self.path / f"views/{event.number:06d}.npz"
 
-    def _view(self, number: int) -> View:
+    def _read_view(self, event: Event) -> View:
         """Read a view.
 
         Raises:
             InputError: Its file is missing, or has changed.
         """
-        path, stored = self._file(number), [e.view for e in self._events if e.view][number]
+        path = self._file(event)
         with read_errors(path, RESTORE):
             content = path.read_bytes()
-        if hashlib.sha256(content).hexdigest() != stored.digest:
+        if hashlib.sha256(content).hexdigest() != event.digest:
             raise InputError(path, "has changed since it was written", RESTORE)
         view: View = unpack(content, (View,))
-        return replace(view, name=stored.name)
+        return replace(view, name=event.name)
+
+    def _apply(self, event: Event, scene: Scene) -> None:
+        if event.kind == "view":
+            scene.update(self._read_view(event))
+        elif event.T is None:
+            scene.removed(event.name)
+        else:
+            scene.moved(event.name, event.T)
 
     def _after(self, events: Sequence[Event]) -> Scene:
         """The scene after some events, from the newest usable snapshot and what came after it."""
         b = self.beginning
         done, scene = self._read_snapshot(events)
         scene = scene or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
-        views = sum(event.view is not None for event in events[:done])
-        for number, event in enumerate(events[done:], start=done):
-            if event.report:
-                event.report.apply(scene)
-            else:
-                scene.update(self._view(views))
-                views += 1
+        for number, event in enumerate(events[done:], start=done + 1):
+            self._apply(event, scene)
             if self._log.writable:
-                self._write_snapshot(scene, events[: number + 1])
+                self._write_snapshot(scene, events[:number])
         return scene
 
     def _read_snapshot(self, events: Sequence[Event]) -> tuple[int, Scene | None]:
@@ -606,9 +568,13 @@ class Session:
 
     def _snapshot(self, events: Sequence[Event]) -> Path:
         """File of the scene after these events, named by them and the code that made it."""
-        told = (event.view.digest if event.view else str(event.to_json()) for event in events)
-        made_of = " ".join((fingerprint(), repr(self.beginning), *told))
+        made_of = " ".join((fingerprint(), repr(self.beginning), *map(_told, events)))
         return self.path / "state" / f"{hashlib.sha256(made_of.encode()).hexdigest()}.pickle"
+
+
+def _told(event: Event) -> str:
+    """What tells an event from others."""
+    return event.digest or f"{event.name} {None if event.T is None else event.T.tolist()}"
 
 
 class _Unpickler(pickle.Unpickler):
