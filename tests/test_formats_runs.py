@@ -255,4 +255,7 @@ def test_a_broken_run_is_refused(tmp_path, name, content, said):
     path = tmp_path / "RUN" / name
     path.unlink() if content is None else path.write_bytes(content)
     with refusal(tmp_path / "RUN", said):
-        read_run(tmp_path / "RUN").views[1].load_labels()
+        view = read_run(tmp_path / "RUN").views[1]
+        assert view.name
+        assert view.graph
+        view.load_labels()

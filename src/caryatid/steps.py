@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -157,28 +158,33 @@ class RunWriter(StagedFolder):
         self.publish()
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class RunView:
-    """A view of a run.
+    """A view of a run, whose files are read when needed; a missing or broken one raises `InputError`.
 
     Attributes:
-        name: The view's name, which identifies a recording's frame.
-        graph: The fused graph after this view.
-        record: All of view.json.
         folder: Its folder, `views/NN`.
     """
 
-    name: str
-    graph: SupportGraph
-    record: dict[str, Any]
     folder: Path
 
-    def load_labels(self) -> NDArray[np.int32]:
-        """Read the label image (H, W), or the labels (N,) of a cloud's points.
+    @cached_property
+    def record(self) -> dict[str, Any]:
+        """All of view.json."""
+        return read_json(self.folder / "view.json", AGAIN)
 
-        Raises:
-            InputError: The file is missing, broken or of another kind.
-        """
+    @property
+    def name(self) -> str:
+        """The view's name, which identifies a recording's frame."""
+        return parse_json(_ViewFile, self.record, self.folder / "view.json", AGAIN).name
+
+    @cached_property
+    def graph(self) -> SupportGraph:
+        """The fused graph after this view."""
+        return read_graph(self.folder / "graph.json")
+
+    def load_labels(self) -> NDArray[np.int32]:
+        """Read the label image (H, W), or the labels (N,) of a cloud's points."""
         path = self.folder / "labels.npy"
         if not path.exists():
             return images.read_units(self.folder / "labels.png")
@@ -186,6 +192,16 @@ class RunView:
         if labels.ndim != 1 or labels.dtype.kind not in "iu":
             raise InputError(path, "not an array of integers (N,)", AGAIN)
         return labels.astype(np.int32)
+
+    def load_step(self) -> Step:
+        """Read the whole step."""
+        path, remedy = self.folder / "step.npz", "explore again"
+        with read_errors(path, remedy):
+            content = path.read_bytes()
+        try:
+            return _with_cloud(Step(**unpack(content, PARTS), graph=self.graph), np.float64)
+        except Exception as error:  # a damaged archive raises almost anything
+            raise InputError(path, f"not a step of a run ({' '.join(str(error).split())})", remedy) from error
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -243,10 +259,10 @@ class _ViewFile:
 
 
 def read_run(folder: str | Path) -> Run:
-    """Read a run folder; label images are read when needed.
+    """Read a run folder; the files of its views are read when needed.
 
     Raises:
-        InputError: It is not a run folder, or a file in it is missing or broken.
+        InputError: It is not a run folder, or a file of the whole run is missing or broken.
     """
     folder = Path(folder)
     remedy = "give a run folder, as written by explore, extract or clear, or a session"
@@ -259,7 +275,7 @@ def read_run(folder: str | Path) -> Run:
     file = parse_json(_RunFile, record, path, AGAIN)
     if file.scores and len(file.scores) != file.views:
         raise InputError(path, f"the number of scores, {len(file.scores)}, is not that of views", AGAIN)
-    views = tuple(_read_view(folder / _view_folder(index)) for index in range(file.views))
+    views = tuple(RunView(folder / _view_folder(index)) for index in range(file.views))
     return Run(folder, record, read_graph(folder / "graph.json"), views)
 
 
@@ -274,7 +290,7 @@ def read_steps(run: Run) -> Iterator[Step]:
         reason = f"written by caryatid {ours}, which did not store views"
         remedy = "repeat the run; order, evaluate and export need only its graph"
         raise InputError(run.folder, reason, remedy)
-    return (_read_step(view.folder) for view in run.views)
+    return (view.load_step() for view in run.views)
 
 
 def read_config(run: Run) -> Config:
@@ -328,13 +344,6 @@ def _view_folder(index: int) -> str:
     return f"views/{index:02d}"
 
 
-def _read_view(folder: Path) -> RunView:
-    path = folder / "view.json"
-    record = read_json(path, AGAIN)
-    name = parse_json(_ViewFile, record, path, AGAIN).name
-    return RunView(name, read_graph(folder / "graph.json"), record, folder)
-
-
 def _summary(step: Step) -> dict[str, Any]:
     """Entries of view.json about the camera, the candidates and the choice of the next view."""
     record: dict[str, Any] = {key: getattr(step.view, key, None) for key in ("T_world_camera", "K")}
@@ -358,18 +367,6 @@ def _summary(step: Step) -> dict[str, Any]:
             quartiles = np.quantile(decision.candidate_saliency, (0.0, 0.25, 0.5, 0.75, 1.0))
             record["next"]["candidate_saliency_quartiles"] = quartiles
     return record
-
-
-def _read_step(folder: Path) -> Step:
-    """The step in a folder `views/NN`."""
-    path, remedy = folder / "step.npz", "explore again"
-    with read_errors(path, remedy):
-        content = path.read_bytes()
-    try:
-        step = Step(**unpack(content, PARTS), graph=read_graph(folder / "graph.json"))
-        return _with_cloud(step, np.float64)
-    except Exception as error:  # a damaged archive raises almost anything
-        raise InputError(path, f"not a step of a run ({' '.join(str(error).split())})", remedy) from error
 
 
 def _with_cloud(step: Step, dtype: type[np.floating[Any]]) -> Step:
