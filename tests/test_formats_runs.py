@@ -117,8 +117,10 @@ def test_an_interrupted_run_is_kept_with_the_views_done(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "write_bytes", interrupt)
     with pytest.raises(KeyboardInterrupt, match="1 view is kept"):
         write_run(tmp_path / "RUN")
-    assert read_run(tmp_path / "RUN").record["interrupted"]
-    assert [view.name for view in read_run(tmp_path / "RUN").views] == ["scene/000000"]
+    run = read_run(tmp_path / "RUN")
+    assert run.record["interrupted"]
+    assert [view.name for view in run.views] == ["scene/000000"]
+    assert len(run.graph.objects) == len(run.views[0].graph.objects) == 1
     assert not (tmp_path / "RUN/views/01").exists()
 
 

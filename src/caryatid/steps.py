@@ -110,20 +110,21 @@ class RunWriter(StagedFolder):
         if labels.size and not 0 <= labels.min() <= labels.max() <= SUPPORT_LABEL:
             reason = f"labels are not all within 0…{SUPPORT_LABEL}"
             raise InputError(step.name, reason, "number objects from 1, 0 = no object")
-        self.files["graph.json"] = graph_text(step.graph).encode()
         document = {"view": number, "name": step.name} | _summary(step)
         stored = _with_cloud(step, np.float32)
         parts = {f.name: getattr(stored, f.name) for f in fields(stored) if f.name != "graph"}
-        files = {"view.json": json_text(document).encode(), "step.npz": pack(parts)}
+        graph, about = graph_text(step.graph).encode(), json_text(document).encode()
+        files = {"graph.json": graph, "view.json": about, "step.npz": pack(parts)}
         if labels.ndim == 2:
             files["labels.png"] = images.png(labels.astype(np.uint16))
         else:
             files["labels.npy"] = images.npy(labels.astype(np.int32))
-        for name, content in ({"graph.json": self.files["graph.json"]} | files).items():
+        for name, content in files.items():
             self.write(f"{_view_folder(number)}/{name}", content)
         names = ("timings", "angle_travelled", "path_travelled", "stop")
         self.steps.append({"view": step.index} | {name: getattr(step, name) for name in names})
         self._scores += [] if score is None else [score]
+        self.files["graph.json"] = graph
         if self._stepwise:
             self._finish({"unfinished": True} if step.decision is not None else {})
 
