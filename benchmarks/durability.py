@@ -77,14 +77,20 @@ def _run(arguments: list[str], said: Path) -> None:
     os._exit(status)
 
 
-def run(arguments: Sequence[object], said: Path, seconds: float | None = None) -> bool:
-    """Run a command to its end, or kill it after this long [s]; return whether it ended."""
-    process = start(arguments, said)
+def stop(process: BaseProcess, said: Path, seconds: float | None = 0.0) -> bool:
+    """Kill a command after this long [s]; None lets it end. Return whether it had ended."""
     process.join(seconds)
     process.kill()
     process.join()
     assert process.exitcode in (0, -signal.SIGKILL), said.read_text()
     return process.exitcode == 0
+
+
+def wait_for_change(look: Callable[[Path], object], place: Path, process: BaseProcess) -> None:
+    """Wait until a place looks different, or a command has ended."""
+    before = look(place)
+    while process.is_alive() and look(place) == before:
+        time.sleep(0.0005)
 
 
 def address_of(said: Path) -> str:
@@ -131,7 +137,9 @@ def events_in(session: Path, acknowledged: int, graphs: Sequence[str]) -> int:
 
 
 def kill_session(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `session add` of all views and `session take` of all objects, at random moments.
+    """Kill `session add` of all views and `session take` of all objects.
+
+    Of three commands, one ends, one is killed at a random moment, and one as soon as it writes.
 
     Returns the counts of events: killed before or after they were stored, or acknowledged before the kill.
     """
@@ -155,17 +163,24 @@ def kill_session(folder: Path, views: Sequence[View], kills: int, seed: int) -> 
             session, known = folder / f"session-{tally.total()}", 0
             Session.begin(session, segmentation="labels").close()
         words = ["session", steps[known][0], session, *steps[known][1:], "--json"]
-        begun, first = time.monotonic(), tally["acknowledged"] == 0
-        # The end of a command, in which it writes, gets half of the kills.
-        moment = chance.uniform(0.8 if tally.total() % 2 else 0.0, 1.2) * usual
-        ended = run(words, folder / "said", None if first else moment)
+        begun, process, moment = time.monotonic(), start(words, folder / "said"), None
+        if tally.total() % 3 == 1:
+            moment = chance.uniform(0.0, 1.1) * usual
+        elif tally.total() % 3 == 2:
+            wait_for_change(written, session, process)
+            moment = chance.uniform(0.0, 0.04)
+        ended = stop(process, folder / "said", moment)
         found = events_in(session, known, graphs)
         assert not ended or found == known + 1, "an acknowledged event is lost"
         tally["acknowledged" if ended else "kept" if found > known else "not kept"] += 1
-        if ended:
-            usual = 0.7 * usual + 0.3 * (time.monotonic() - begun)
+        usual = time.monotonic() - begun if moment is None else usual
         known = found
     return tally
+
+
+def written(session: Path) -> tuple[set[str], int]:
+    """Names of the files of a session, and the size of its log."""
+    return {path.name for path in session.rglob("*")}, (session / "session.jsonl").stat().st_size
 
 
 def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
@@ -211,7 +226,7 @@ def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> 
 
 
 def kill_runs(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `explore` and `extract` while they replace an older run; half of the kills come at their end.
+    """Kill `explore` and `extract` while they replace an older run; every other time as they publish.
 
     After each kill, a whole run exists or the next command recovers it; no other files remain at the end.
     """
@@ -225,20 +240,29 @@ def kill_runs(folder: Path, views: Sequence[View], kills: int, seed: int) -> Cou
         command += ["--out", out, "--quiet", "--seed"]
         for _ in range(2):
             begun = time.monotonic()
-            run([*command, 0], said)
+            stop(start([*command, 0], said), said, None)
         took = time.monotonic() - begun
         for number in range(1, kills // 2 + 1):
-            ended = run([*command, number], said, chance.uniform(0.85 if number % 2 else 0.0, 1.1) * took)
+            process, moment = start([*command, number], said), chance.uniform(0.0, 1.1) * took
+            if number % 2:
+                wait_for_change(staged, out.parent, process)
+                moment = chance.uniform(0.0, 0.01)
+            ended = stop(process, said, moment)
             tally["ended before" if ended else "killed"] += 1
             tally["recovered"] += not out.exists()
-            assert _seed_of(out) in range(number + 1)
-        run([*command, kills], said)
+            assert seed_of(out) in range(number + 1)
+        stop(start([*command, kills], said), said, None)
         assert os.listdir(out.parent) == ["run"], "other files remain after the next run"
-        assert _seed_of(out) == kills
+        assert seed_of(out) == kills
     return tally
 
 
-def _seed_of(folder: Path) -> int:
+def staged(place: Path) -> list[Path]:
+    """Runs that are whole and about to be published."""
+    return list(place.glob(".partial-run-*/run.json"))
+
+
+def seed_of(folder: Path) -> int:
     """Read a whole run and return its seed."""
     found = read_run(folder)
     assert len(found.views) == len(found.record["steps"])
@@ -251,11 +275,11 @@ def kill_clearing(folder: Path, _: Sequence[View], kills: int, seed: int) -> Cou
     chance, tally, said = random.Random(seed), Counter[str](), folder / "said"
     words = ["clear", "tower", "--no-report", "--hands", 1, "--quiet", *SMALL, "--out"]
     begun = time.monotonic()
-    run([*words, folder / "whole"], said)
+    stop(start([*words, folder / "whole"], said), said, None)
     took, whole = time.monotonic() - begun, read_run(folder / "whole")
     out, known = folder / "runs" / "run", 0
     while tally["killed"] < kills:
-        ended = run([*words, out], said, chance.uniform(0.0, 0.6) * took)
+        ended = stop(start([*words, out], said), said, chance.uniform(0.0, 0.6) * took)
         tally["ended" if ended else "killed"] += 1
         found = len(read_run(out).views) if out.exists() else 0
         assert found >= known, "stored views are lost"

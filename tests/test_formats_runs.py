@@ -234,7 +234,11 @@ RECORD = ABOUT | {"format": "caryatid/run", "version": 2, "views": 2}
     ("name", "content", "said"),
     [
         ("run.json", b'{"format": "other"}', "'format' is \"other\": must be 'caryatid/run'"),
-        ("run.json", b'{"format": "caryatid/run", "version": 3, "views": 1}', "must be 1 or 2"),
+        (
+            "run.json",
+            b'{"format": "caryatid/run", "version": 3, "views": 1}',
+            "must be 2; run",
+        ),
         ("run.json", b'{"format": "caryatid/run", "version": 2, "views": 0}', "'views' is 0"),
         ("run.json", b'{"format": "caryatid/run", "version": 2, "views": 2}', "'source' is missing"),
         ("run.json", json.dumps(RECORD | {"source": 3}).encode(), "'source' is 3"),

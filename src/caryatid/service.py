@@ -48,8 +48,7 @@ from caryatid.runtime.parallel import cores
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.captures import CameraRecord
 from caryatid.sessions.next_view import CandidateViews
-from caryatid.sessions.session import Added, SessionConflictError
-from caryatid.steps import is_session
+from caryatid.sessions.session import Added, SessionConflictError, is_session
 
 
 class FullError(CaryatidError):

@@ -31,10 +31,10 @@ from caryatid.scene import KEPT, LEFT_OUT
 from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import Camera
 from caryatid.sensing.voxel_map import VoxelMap
-from caryatid.sessions.session import Session
+from caryatid.sessions.session import Session, is_session
 from caryatid.simulation.scenes import is_builtin, load_scene
 from caryatid.simulation.setup import make_simulation
-from caryatid.steps import Run, RunWriter, is_run, is_session, read_run
+from caryatid.steps import Run, RunWriter, is_run, read_run
 
 log = logging.getLogger(__name__)
 

@@ -37,8 +37,6 @@ from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.support.relations import Effect, Removal
 
 FORMAT: Final = "caryatid/run"
-SESSION_FILE: Final = "session.jsonl"
-"""Log of a session."""
 AGAIN: Final = "run caryatid again"
 """Remedy for a broken file of a run."""
 PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
@@ -237,10 +235,10 @@ class _Score:
 
 @dataclass(frozen=True, slots=True)
 class _RunFile:
-    """run.json; version 1, of caryatid 0.1.0, has no step.npz."""
+    """run.json; runs of version 1, of caryatid 0.1.0, kept no steps."""
 
     format: Literal["caryatid/run"]
-    version: Literal[1, 2]
+    version: Literal[2]
     views: PositiveInt
     source: str
     seed: int
@@ -284,13 +282,8 @@ def read_steps(run: Run) -> Iterator[Step]:
     """Read the steps of a run, one after the other.
 
     Raises:
-        InputError: A step is missing or broken, or the run was written by a version that kept no steps.
+        InputError: A step is missing or broken.
     """
-    if run.record["version"] == 1:
-        ours = run.record.get("versions", {}).get("caryatid", "0.1.0")
-        reason = f"written by caryatid {ours}, which did not store views"
-        remedy = "repeat the run; order, evaluate and export need only its graph"
-        raise InputError(run.folder, reason, remedy)
     return (view.load_step() for view in run.views)
 
 
@@ -309,11 +302,6 @@ def is_run(folder: Path) -> bool:
         return _exists(folder) and read_json(folder / "run.json").get("format") == FORMAT
     except InputError:
         return False
-
-
-def is_session(folder: Path) -> bool:
-    """Whether a folder is a session, perhaps of an earlier release; other commands read it as a run."""
-    return any((folder / name).is_file() for name in (SESSION_FILE, "session.json"))
 
 
 def _exists(folder: Path) -> bool:

@@ -55,8 +55,9 @@ from caryatid.segmentation.view_checks import described
 from caryatid.sensing.views import View
 from caryatid.sessions.captures import Capture
 from caryatid.sessions.next_view import REFUSED, NextView, reached_candidates, table_floor
-from caryatid.steps import SESSION_FILE, is_session
 
+SESSION_FILE: Final = "session.jsonl"
+"""Name of the log."""
 FORMAT: Final = {"format": "caryatid/session", "version": 2}
 """How the first line begins."""
 NO_SESSION: Final = "not a session", "create one with `caryatid session new`"
@@ -79,6 +80,11 @@ KNOWN: Final = {
 """What a snapshot may contain of other packages."""
 ORIGINS: Final = {"config", "geometry", "graph", "objects", "scene", "segmentation", "sensing"}
 """Parts of caryatid whose types it may contain. No other type is restored: a foreign session runs no code."""
+
+
+def is_session(folder: Path) -> bool:
+    """Whether a folder is a session, perhaps of an earlier release."""
+    return any((folder / name).is_file() for name in (SESSION_FILE, "session.json"))
 
 
 class SessionConflictError(InputError):
