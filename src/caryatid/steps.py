@@ -26,7 +26,6 @@ from caryatid.graph import Change, Grasp, SupportGraph, TakeStep
 from caryatid.io import images
 from caryatid.io.graph_json import graph_text, read_graph
 from caryatid.io.json_files import json_text, parse_json, read_json
-from caryatid.io.packing import pack, unpack
 from caryatid.io.staging import StagedFolder, read_errors, recover
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
@@ -112,7 +111,7 @@ class RunWriter(StagedFolder):
         stored = _with_cloud(step, np.float32)
         parts = {f.name: getattr(stored, f.name) for f in fields(stored) if f.name != "graph"}
         graph, about = graph_text(step.graph).encode(), json_text(document).encode()
-        files = {"graph.json": graph, "view.json": about, "step.npz": pack(parts)}
+        files = {"graph.json": graph, "view.json": about, "step.npz": images.pack(parts)}
         if labels.ndim == 2:
             files["labels.png"] = images.png(labels.astype(np.uint16))
         else:
@@ -198,7 +197,7 @@ class RunView:
         with read_errors(path, remedy):
             content = path.read_bytes()
         try:
-            return _with_cloud(Step(**unpack(content, PARTS), graph=self.graph), np.float64)
+            return _with_cloud(Step(**images.unpack(content, PARTS), graph=self.graph), np.float64)
         except Exception as error:  # a damaged archive raises almost anything
             raise InputError(path, f"not a step of a run ({' '.join(str(error).split())})", remedy) from error
 

@@ -41,10 +41,9 @@ from caryatid.exploration import (
 from caryatid.geometry.transforms import Array, as_rigid
 from caryatid.graph import Change, SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
-from caryatid.io.images import png, read_mask
+from caryatid.io.images import pack, png, read_mask, unpack
 from caryatid.io.json_files import Numbers, parse_json
 from caryatid.io.log import LATER, Log
-from caryatid.io.packing import pack, unpack
 from caryatid.io.staging import read_errors, recover, sync, write_errors, write_file
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner
@@ -66,8 +65,6 @@ RESTORE: Final = "restore this file, or delete this view and all later lines fro
 """Remedy for a damaged view."""
 ANOTHER_RELEASE: Final = "open it with that release, or add its views to a new session"
 """Remedy for a session of another release."""
-SNAPSHOTS: Final = 8
-"""Number of the newest snapshots that are kept, so that a few views are undone at once."""
 
 KNOWN: Final = {
     ("builtins", "set"),
@@ -562,13 +559,13 @@ class Session:
         return 0, None
 
     def _write_snapshot(self, scene: Scene, events: Sequence[Event]) -> None:
-        """Keep the scene of all events, and those of a few events less; a failure costs only time."""
+        """Keep the scene of all events, and of up to seven less, for undo; a failure costs only time."""
         with suppress(Exception):
             path = self._snapshot(events)
             path.parent.mkdir(exist_ok=True)
             # Not compressed; gzip has the checksum.
             write_file(path, gzip.compress(pickle.dumps(scene, protocol=5), compresslevel=0))
-            kept = {self._snapshot(events[: len(events) - back]) for back in range(SNAPSHOTS)}
+            kept = {self._snapshot(events[: len(events) - back]) for back in range(8)}
             for older in set(path.parent.iterdir()) - kept:
                 older.unlink()
 
