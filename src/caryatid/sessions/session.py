@@ -288,7 +288,7 @@ class Session:
         folder = Path(path)
         if not (folder / SESSION_FILE).is_file():
             if is_session(folder):
-                raise InputError(folder, "a session of an earlier caryatid", ANOTHER_RELEASE)
+                raise InputError(folder, "is a session of an earlier caryatid", ANOTHER_RELEASE)
             raise InputError(folder, *NO_SESSION)
         if read_only:
             with suppress(InputError):  # a writer may have replaced an undone view just now
