@@ -3,8 +3,8 @@
     python benchmarks/durability.py [--only runs load] [--kills 200] [--views 1000] [--clients 50]
 
 `session add`, `session take` and `serve` are killed; after each kill, the session is opened and its graph is
-compared with that of the same views without a kill. `explore`, `extract`, `clear`, `benchmark` and the first
-compilation are killed too: their output stays whole, and the next run continues or replaces it and cleans up.
+compared with that of the same events without a kill. `explore`, `extract`, `clear` and `benchmark` are killed
+too: their output stays whole, and the next run continues or replaces it and cleans up.
 Then clients, some of them hostile, put load on a service. An `AssertionError` says what was lost.
 """
 
@@ -25,11 +25,10 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from threading import Event, Lock, Thread
+from threading import Event, Lock
 from typing import Annotated, Any
 from urllib.parse import urlsplit
 
@@ -78,12 +77,20 @@ def _run(arguments: list[str], said: Path) -> None:
     os._exit(status)
 
 
-def kill(process: BaseProcess) -> int:
-    """Kill a command and return its exit status, -9 unless it ended before."""
+def stop(process: BaseProcess, said: Path, seconds: float | None = 0.0) -> bool:
+    """Kill a command after this long [s]; None lets it end. Return whether it had ended."""
+    process.join(seconds)
     process.kill()
     process.join()
-    assert process.exitcode is not None
-    return process.exitcode
+    assert process.exitcode in (0, -signal.SIGKILL), said.read_text()
+    return process.exitcode == 0
+
+
+def wait_for_change(look: Callable[[Path], object], place: Path, process: BaseProcess) -> None:
+    """Wait until a place looks different, or a command has ended."""
+    before = look(place)
+    while process.is_alive() and look(place) == before:
+        time.sleep(0.0005)
 
 
 def address_of(said: Path) -> str:
@@ -120,108 +127,66 @@ def sent(view: View) -> dict[str, Any]:
     return {"depth": depth, "K": view.K.tolist(), "T_world_camera": view.pose.tolist(), "labels": labels}
 
 
-def graphs_of(views: Sequence[View]) -> list[str]:
-    """Return graph.json after zero, one, two … of the views."""
-    scene = Scene(segmentation="labels")
-    return [graph_text(scene.graph), *(graph_text(scene.update(view)) for view in views)]
-
-
-def views_in(session: Path, acknowledged: int, graphs: Sequence[str]) -> int:
-    """Check and return how many views a session has after a kill: those acknowledged, at most one more."""
+def events_in(session: Path, acknowledged: int, graphs: Sequence[str]) -> int:
+    """Check and return how many events a session has after a kill: those acknowledged, at most one more."""
     with Session.open(session) as opened:
-        found = opened.views
-        assert 0 <= found - acknowledged <= 1, f"{found} views, but {acknowledged} were acknowledged"
-        assert graph_text(opened.graph) == graphs[found], "the session differs from one of the same views"
+        found = opened.views + opened.reports
+        assert 0 <= found - acknowledged <= 1, f"{found} events, but {acknowledged} were acknowledged"
+        assert graph_text(opened.graph) == graphs[found], "the session differs from one of the same events"
     return found
 
 
-def judge(tally: Counter[str], status: int, new: int, said: Path) -> None:
-    """Count the outcome of one view or report: acknowledged, or killed before or after it was stored."""
-    if status == 0:
-        assert new == 1, "an acknowledged view or report is lost"
-        tally["acknowledged"] += 1
-    else:
-        assert status == -9, said.read_text()
-        assert new in (0, 1)
-        tally["kept" if new else "not kept"] += 1
+def kill_session(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
+    """Kill `session add` of all views and `session take` of all objects.
 
+    Of three commands, one ends, one is killed at a random moment, and one as soon as it writes.
 
-def kill_adding(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `session add` at random moments; every other time after it has begun to write.
-
-    Returns the counts of views: killed before or after they were stored, or acknowledged before the kill.
-    """
-    chance, tally, graphs = random.Random(seed), Counter[str](), graphs_of(views)
-    words: list[list[str]] = []
-    for number, view in enumerate(views):
-        files = sent(view)
-        files["camera"] = json.dumps({name: files.pop(name) for name in ("K", "T_world_camera")}).encode()
-        words.append([])
-        for name, content in files.items():
-            (folder / f"{name}-{number}").write_bytes(content)
-            words[-1].append(f"--{name}={folder / f'{name}-{number}'}")
-    session, usual, known = folder / "session-0", 1.0, 0
-    Session.begin(session, segmentation="labels").close()
-    while tally["kept"] + tally["not kept"] < kills:
-        begun = time.monotonic()
-        options = [*words[known], "--json", "--number", known]
-        process = start(["session", "add", session, *options], folder / "said")
-        if tally["acknowledged"] == 0:
-            process.join()
-        elif sum(tally.values()) % 2 == 1:
-            _wait_for(partial(_any, session / "views", ".partial-*"), 1.1 * usual)
-            time.sleep(chance.uniform(0.0, 0.04))
-        else:
-            process.join(1.1 * usual * chance.random())
-        status = kill(process)
-        found = views_in(session, known, graphs)
-        judge(tally, status, found - known, folder / "said")
-        if status == 0:
-            usual = 0.7 * usual + 0.3 * (time.monotonic() - begun)
-            assert json.loads((folder / "said").read_text())["view"] == known
-        known = found
-        if known == len(views):
-            session, known = folder / f"session-{sum(tally.values())}", 0
-            Session.begin(session, segmentation="labels").close()
-    return tally
-
-
-def kill_taking(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `session take` at random moments, while it takes one object after another.
-
-    Returns the counts of reports, as `kill_adding` does for views.
+    Returns the counts of events: killed before or after they were stored, or acknowledged before the kill.
     """
     chance, tally, usual = random.Random(seed), Counter[str](), 1.0
     scene = Scene(segmentation="labels")
-    for view in views:
-        scene.update(view)
-    ids = [o.id for o in scene.graph.objects if o.role == "object"]
-    graphs = [graph_text(scene.graph), *(graph_text(scene.removed(i)) for i in ids)]
-    session, known = folder / "taking", len(ids)
+    graphs, steps = [graph_text(scene.graph)], list[list[object]]()
+    for number, view in enumerate(views):
+        files = sent(view)
+        files["camera"] = json.dumps({name: files.pop(name) for name in ("K", "T_world_camera")}).encode()
+        paths = {name: folder / f"{name}-{number}" for name in files}
+        for name, content in files.items():
+            paths[name].write_bytes(content)
+        steps.append(["add", *(f"--{name}={path}" for name, path in paths.items()), "--number", number])
+        graphs.append(graph_text(scene.update(view)))
+    for number, o in enumerate([o for o in scene.graph.objects if o.role == "object"]):
+        steps.append(["take", o.id, "--number", number])
+        graphs.append(graph_text(scene.removed(o.id)))
+    known, session = len(steps), folder / "session"
     while tally["kept"] + tally["not kept"] < kills:
-        if known == len(ids):
-            session, known = folder / f"taking-{sum(tally.values())}", 0
-            with Session.begin(session, segmentation="labels") as begun:
-                for view in views:
-                    begun.add(view)
-        at = time.monotonic()
-        process = start(["session", "take", session, ids[known], "--json"], folder / "said")
-        process.join(None if tally["acknowledged"] == 0 else 1.2 * usual * chance.random())
-        status = kill(process)
-        with Session.open(session) as opened:
-            found = graphs.index(graph_text(opened.graph))
-            assert opened.views == len(views)
-            assert len(opened.scene.changes) == found
-        judge(tally, status, found - known, folder / "said")
-        if status == 0:
-            usual = 0.7 * usual + 0.3 * (time.monotonic() - at)
+        if known == len(steps):
+            session, known = folder / f"session-{tally.total()}", 0
+            Session.begin(session, segmentation="labels").close()
+        words = ["session", steps[known][0], session, *steps[known][1:], "--json"]
+        begun, process, moment = time.monotonic(), start(words, folder / "said"), None
+        if tally.total() % 3 == 1:
+            moment = chance.uniform(0.0, 1.1) * usual
+        elif tally.total() % 3 == 2:
+            wait_for_change(written, session, process)
+            moment = chance.uniform(0.0, 0.04)
+        ended = stop(process, folder / "said", moment)
+        found = events_in(session, known, graphs)
+        assert not ended or found == known + 1, "an acknowledged event is lost"
+        tally["acknowledged" if ended else "kept" if found > known else "not kept"] += 1
+        usual = time.monotonic() - begun if moment is None else usual
         known = found
     return tally
+
+
+def written(session: Path) -> tuple[set[str], int]:
+    """Names of the files of a session, and the size of its log."""
+    return {path.name for path in session.rglob("*")}, (session / "session.jsonl").stat().st_size
 
 
 def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
     """Kill `serve` while two clients each add views to a session; return the counts of the views."""
-    chance, tally, graphs = random.Random(seed), Counter[str](), graphs_of(views)
+    chance, tally, scene = random.Random(seed), Counter[str](), Scene(segmentation="labels")
+    graphs = [graph_text(scene.graph), *(graph_text(scene.update(view)) for view in views)]
     payloads, kept = [sent(view) for view in views], {"table-0": 0, "table-1": 0}
     for name in kept:
         Session.begin(folder / name, segmentation="labels").close()
@@ -231,12 +196,10 @@ def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> 
         robot, acknowledged = RobotClient(address_of(folder / "said")), dict(kept)
 
         def add(name: str, robot: RobotClient = robot, acknowledged: dict[str, int] = acknowledged) -> None:
-            try:
+            with suppress(OSError, http.client.HTTPException):  # the service is gone
                 while (number := acknowledged[name]) < len(payloads):
                     assert robot.add(name, **payloads[number], number=number)["view"] == number
                     acknowledged[name] = number + 1
-            except (OSError, http.client.HTTPException):
-                return  # the service is gone
 
         with ThreadPoolExecutor(len(kept)) as threads:
             clients = [threads.submit(add, name) for name in kept]
@@ -244,13 +207,14 @@ def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> 
             while sum(acknowledged.values()) < wanted and not all(client.done() for client in clients):
                 time.sleep(0.002)
             time.sleep(chance.uniform(0.0, 0.4))
-            kill(process)
+            process.kill()
+            process.join()
             robot.patience = 0.0
         for client in clients:
             client.result()
         tally["kills"] += 1
         for name, sure in acknowledged.items():
-            found = views_in(folder / name, sure, graphs)
+            found = events_in(folder / name, sure, graphs)
             tally["acknowledged"] += sure - kept[name]
             tally["kept unsaid"] += found - sure
             kept[name] = found
@@ -262,80 +226,68 @@ def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> 
 
 
 def kill_runs(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `explore` and `extract` while they replace an older run, half of the time while they publish.
+    """Kill `explore` and `extract` while they replace an older run; every other time as they publish.
 
     After each kill, a whole run exists or the next command recovers it; no other files remain at the end.
     """
-    chance, tally = random.Random(seed), Counter[str]()
+    chance, tally, said = random.Random(seed), Counter[str](), folder / "said"
     write_recording(folder / "recording", views[:2])
-    took: dict[int, float] = {}
-    commands: tuple[list[object], ...] = (
-        ["explore", "tower", "--views", 2, *SMALL],
-        ["extract", folder / "recording"],
-    )
-    for number in range(kills):
-        run, words = folder / f"runs-{number % 2}" / "run", commands[number % 2]
-        words = [*words, "--out", run, "--quiet"]
-        if not run.parent.exists():
-            _finish([*words, "--seed", 0], folder / "said")
+    for name, command in (
+        ("explore", ["explore", "tower", "--views", 2, *SMALL]),
+        ("extract", ["extract", folder / "recording"]),
+    ):
+        out = folder / name / "run"
+        command += ["--out", out, "--quiet", "--seed"]
+        for _ in range(2):
             begun = time.monotonic()
-            _finish([*words, "--seed", 0], folder / "said")
-            took[number % 2] = time.monotonic() - begun
-        process = start([*words, "--seed", number + 1], folder / "said")
-        if number % 4 < 2:
-            process.join(chance.uniform(0.0, 1.1) * took[number % 2])
-        else:
-            pattern = f".partial-{run.name}-*/run.json"
-            _wait_for(partial(_any, run.parent, pattern), 2.0 * took[number % 2])
-            time.sleep(chance.uniform(0.0, 0.01))
-        status = kill(process)
-        assert status in (0, -9), (folder / "said").read_text()
-        tally["ended before" if status == 0 else "killed"] += 1
-        if not run.exists():
-            tally["recovered"] += 1
-            assert cli.main([*map(str, words), "--set=sensor.width=0"]) != 0  # an invalid command
-        _check_run(run)
-    for number, words in enumerate(commands):
-        run = folder / f"runs-{number}" / "run"
-        _finish([*words, "--out", run, "--quiet", "--seed", kills + 1], folder / "said")
-        assert os.listdir(run.parent) == ["run"], "other files remain after the next run"
-        assert _check_run(run) == kills + 1
+            stop(start([*command, 0], said), said, None)
+        took = time.monotonic() - begun
+        for number in range(1, kills // 2 + 1):
+            process, moment = start([*command, number], said), chance.uniform(0.0, 1.1) * took
+            if number % 2:
+                wait_for_change(staged, out.parent, process)
+                moment = chance.uniform(0.0, 0.01)
+            ended = stop(process, said, moment)
+            tally["ended before" if ended else "killed"] += 1
+            tally["recovered"] += not out.exists()
+            assert seed_of(out) in range(number + 1)
+        stop(start([*command, kills], said), said, None)
+        assert os.listdir(out.parent) == ["run"], "other files remain after the next run"
+        assert seed_of(out) == kills
     return tally
 
 
-def _any(folder: Path, pattern: str) -> bool:
-    return any(folder.glob(pattern))
+def staged(place: Path) -> list[Path]:
+    """Runs that are whole and about to be published."""
+    return list(place.glob(".partial-run-*/run.json"))
 
 
-def _check_run(folder: Path) -> int:
+def seed_of(folder: Path) -> int:
     """Read a whole run and return its seed."""
-    run = read_run(folder)
-    assert len(run.views) == len(run.record["steps"])
-    assert all(view.load_labels().any() for view in run.views)
-    return int(run.record["seed"])
+    found = read_run(folder)
+    assert len(found.views) == len(found.record["steps"])
+    assert all(view.load_labels().any() for view in found.views)
+    return int(found.record["seed"])
 
 
 def kill_clearing(folder: Path, _: Sequence[View], kills: int, seed: int) -> Counter[str]:
     """Kill `clear` at random moments; the same command continues, and ends as it does without a kill."""
-    chance, tally = random.Random(seed), Counter[str]()
+    chance, tally, said = random.Random(seed), Counter[str](), folder / "said"
     words = ["clear", "tower", "--no-report", "--hands", 1, "--quiet", *SMALL, "--out"]
     begun = time.monotonic()
-    _finish([*words, folder / "whole"], folder / "said")
+    stop(start([*words, folder / "whole"], said), said, None)
     took, whole = time.monotonic() - begun, read_run(folder / "whole")
-    run, known = folder / "runs" / "run", 0
+    out, known = folder / "runs" / "run", 0
     while tally["killed"] < kills:
-        process = start([*words, run], folder / "said")
-        process.join(chance.uniform(0.0, 0.6) * took)
-        status = kill(process)
-        assert status in (0, -9), (folder / "said").read_text()
-        tally["killed" if status else "ended"] += 1
-        found = len(read_run(run).views) if run.exists() else 0
+        ended = stop(start([*words, out], said), said, chance.uniform(0.0, 0.6) * took)
+        tally["ended" if ended else "killed"] += 1
+        found = len(read_run(out).views) if out.exists() else 0
         assert found >= known, "stored views are lost"
         known = found
-        if status == 0:
-            assert os.listdir(run.parent) == ["run"], "other files remain after the run"
-            assert read_run(run).record["lifts"] == whole.record["lifts"], "the lifts differ"
-            run, known = folder / f"runs-{tally['ended']}" / "run", 0
+        if ended:
+            assert os.listdir(out.parent) == ["run"], "other files remain after the run"
+            assert read_run(out).record["lifts"] == whole.record["lifts"], "the lifts differ"
+            out, known = folder / f"runs-{tally['ended']}" / "run", 0
     return tally
 
 
@@ -343,63 +295,22 @@ def kill_benchmark(folder: Path, _: Sequence[View], kills: int, seed: int) -> Co
     """Kill a benchmark and its workers at random moments; finished episodes are kept, and none runs twice."""
     chance, tally, out, known = random.Random(seed), Counter[str](), folder / "out", 0
     words = ["benchmark", "--suite=smoke", "--scenes=tower", "--planner=random", "--views=2", "--jobs=2"]
-    command = [sys.executable, "-m", "caryatid", *words, f"--out={out}", *SMALL]
-    for number in range(kills + 1):
-        seeds = f"--seeds={4 * (kills if number == kills else number + 1)}"
-        process = subprocess.Popen([*command, seeds, "--quiet"], start_new_session=True)
-        if number == kills:
-            assert process.wait() == 0
-        else:
-            time.sleep(chance.uniform(0.5, 6.0))
-            tally["killed" if process.poll() is None else "ended before"] += 1
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+    command = [sys.executable, "-m", "caryatid", *words, f"--out={out}", *SMALL, "--quiet"]
+    for number in range(1, kills + 1):
+        process = subprocess.Popen([*command, f"--seeds={4 * number}"], start_new_session=True)
+        time.sleep(chance.uniform(0.5, 6.0))
+        tally["killed" if process.poll() is None else "ended before"] += 1
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
         if (out / RESULTS).exists():
-            with ResultStore(out / RESULTS) as store:
-                assert len(store.outcomes) >= known, "a finished episode is lost"
-                known = len(store.outcomes)
+            found = len(ResultStore(out / RESULTS).outcomes)
+            assert found >= known, "a finished episode is lost"
+            known = found
+    subprocess.run([*command, f"--seeds={4 * kills}"], check=True)
     keys = [line["key"] for line in map(json.loads, (out / RESULTS).open()) if "key" in line]
     assert len(keys) == len(set(keys)) == 4 * kills, "an episode is missing or ran twice"
     return tally
-
-
-def kill_compiling(folder: Path, _: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill the first compilation at random moments; no compiler outlives it, and the next run completes."""
-    chance, tally = random.Random(seed), Counter[str]()
-    code = "from caryatid.simulation.warm_up import warm_up; warm_up()"
-    for number in range(kills):
-        environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / f"kernels-{number // 5}")}
-        process = subprocess.Popen([sys.executable, "-c", code], env=environment)
-        time.sleep(chance.uniform(0.5, 15.0))
-        tally["killed" if process.poll() is None else "ended before"] += 1
-        process.kill()
-        process.wait()
-        _wait_for(lambda: not _processes_of(str(folder)), 5.0)
-        assert not _processes_of(str(folder)), "a compiler outlives its command"
-        if number % 5 == 4 or number == kills - 1:
-            subprocess.run([sys.executable, "-c", code], env=environment, check=True)
-            tally["completed"] += 1
-    return tally
-
-
-def _processes_of(text: str) -> list[int]:
-    """Return the processes whose command line contains a text."""
-    return [p.pid for p in psutil.process_iter(["cmdline"]) if text in " ".join(p.info["cmdline"] or ())]
-
-
-def _finish(arguments: Sequence[object], said: Path) -> None:
-    """Run a command to its end."""
-    process = start(arguments, said)
-    process.join()
-    assert process.exitcode == 0, said.read_text()
-
-
-def _wait_for(condition: Callable[[], bool], seconds: float) -> None:
-    """Wait until a condition holds, but at most this long [s]."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end and not condition():
-        time.sleep(0.0005)
 
 
 @contextmanager
@@ -423,26 +334,20 @@ def hostile_clients(address: str, count: int) -> Iterator[Counter[str]]:
 
     def send(number: int) -> None:
         chance = random.Random(number)
-        while not stop.is_set():
-            try:
-                with socket.create_connection((where.hostname, where.port), 10.0) as open_one:
-                    open_one.settimeout(10.0)
-                    open_one.sendall(chance.choice(kinds))
-                    answer = open_one.recv(64)
-                tally[answer[9:12].decode("latin-1") or "closed"] += 1
-            except OSError:
-                tally["closed"] += 1
-            stop.wait(0.05)
+        while not stop.wait(0.05):
+            answer = b""
+            with suppress(OSError), socket.create_connection((where.hostname, where.port), 10.0) as client:
+                client.sendall(chance.choice(kinds))
+                answer = client.recv(64)
+            tally[answer[9:12].decode("latin-1") or "closed"] += 1
 
-    threads = [Thread(target=send, args=(number,), daemon=True) for number in range(count)]
-    for thread in threads:
-        thread.start()
-    try:
-        yield tally
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join(20.0)
+    with ThreadPoolExecutor(max(1, count)) as threads:
+        for number in range(count):
+            threads.submit(send, number)
+        try:
+            yield tally
+        finally:
+            stop.set()
 
 
 def put_load(
@@ -486,8 +391,7 @@ def put_load(
     with hostile_clients(robot.address, hostile) as answers, ThreadPoolExecutor(clients) as threads:
         list(threads.map(work, range(clients)))
     found = {name: (robot.session(name)["views"], robot.graph(name)) for name in names}
-    assert service.pid is not None
-    os.kill(service.pid, signal.SIGTERM)
+    service.terminate()
     service.join()
     assert service.exitcode == 0, "the service did not stop cleanly"
     for name, order in orders.items():
@@ -499,16 +403,13 @@ def put_load(
     return orders, seconds, memory, answers
 
 
-KILLS: dict[str, tuple[Callable[[Path, Sequence[View], int, int], Counter[str]], int]] = {
-    "add": (kill_adding, 1),
-    "take": (kill_taking, 1),
-    "serve": (kill_serving, 1),
-    "runs": (kill_runs, 2),
-    "clear": (kill_clearing, 4),
-    "benchmark": (kill_benchmark, 4),
-    "compile": (kill_compiling, 10),
+KILLS: dict[str, Callable[[Path, Sequence[View], int, int], Counter[str]]] = {
+    "session": kill_session,
+    "serve": kill_serving,
+    "runs": kill_runs,
+    "clear": kill_clearing,
+    "benchmark": kill_benchmark,
 }
-"""Name → what to kill, and the divisor of the number of kills for commands that take long."""
 
 
 def main(
@@ -519,40 +420,35 @@ def main(
     views: int = 1000,
     clients: int = 50,
     hostile: int = 10,
-    sessions: int = 8,
 ) -> None:
     """Kill commands and put load on a service; check that no acknowledged data is lost.
 
     Args:
-        only: Checks to run: any of add, take, serve, runs, clear, benchmark, compile, load.
-        kills: Number of kills for `add`, `take` and `serve` each; half as many for `runs`, a quarter for
-            `clear` and `benchmark`, a tenth for `compile`.
+        only: Checks to run: any of session, serve, runs, clear, benchmark, load.
+        kills: Number of kills of each kind.
         seed: Seed of the random moments.
-        views: Number of views in the load test.
+        views: Number of views in the load test, which go to eight sessions; four of them are in memory.
         clients: Number of clients that send these views.
         hostile: Number of clients that send invalid requests meanwhile.
-        sessions: Number of sessions the views go to; the service keeps four of them open.
     """
     around = views_around("clutter", max(12, views))
-    for what, (kill_some, divisor) in KILLS.items():
-        if only and what not in only:
-            continue
-        begun = time.monotonic()
-        with TemporaryDirectory() as folder:
-            tally = kill_some(Path(folder), around[:12], kills // divisor, seed)
-        figures = ", ".join(f"{count} {name}" for name, count in sorted(tally.items()))
-        print(f"{what}: {figures}; nothing lost ({time.monotonic() - begun:.0f} s)", flush=True)
+    for what, kill_some in KILLS.items():
+        if what in (only or KILLS):
+            begun = time.monotonic()
+            with TemporaryDirectory() as folder:
+                tally = kill_some(Path(folder), around[:12], kills, seed)
+            figures = ", ".join(f"{count} {name}" for name, count in sorted(tally.items()))
+            print(f"{what}: {figures}; nothing lost ({time.monotonic() - begun:.0f} s)", flush=True)
     if only and "load" not in only:
         return
-    begun = time.monotonic()
-    load: dict[str, Any] = {"clients": clients, "sessions": sessions, "hostile": hostile}
+    begun, options = time.monotonic(), ("--open-sessions", 4)
+    load: dict[str, Any] = {"clients": clients, "sessions": 8, "hostile": hostile, "options": options}
     with TemporaryDirectory() as folder:
-        options = ("--open-sessions", 4)
-        _, seconds, memory, answers = put_load(Path(folder), around[:views], options=options, **load)
+        _, seconds, memory, answers = put_load(Path(folder), around[:views], **load)
     seconds.sort()
     level = [max(memory[k * views // 5 : (k + 1) * views // 5]) for k in range(5)]
     print(
-        f"{views} views, {clients} clients, {sessions} sessions: none lost, graphs equal, "
+        f"{views} views, {clients} clients, 8 sessions: none lost, graphs equal, "
         f"{views / (time.monotonic() - begun):.1f} views/s; a view and its next view take "
         f"{seconds[len(seconds) // 2]:.2f} s in the median, {seconds[-1]:.2f} s at most; "
         f"peak memory in each fifth of the answers: {', '.join(f'{m:.0f}' for m in level)} MB; "

@@ -35,7 +35,7 @@ from caryatid.segmentation.observation import observe
 from caryatid.segmentation.segments import segment
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import View
-from caryatid.sources import is_recording, open_source
+from caryatid.sources import kind_of, open_source
 
 BUILT_IN = (*EASY, *(f"dense-{size}-{seed}" for seed, size in enumerate(range(10, 18, 2), start=1)))
 """Sources to segment if none are given."""
@@ -61,7 +61,7 @@ class Args(Gated, Simulated):
 
 def views_of(source: str, args: Args, config: Config) -> Iterator[View]:
     """Yield the views of a source, with true labels."""
-    if is_recording(source):
+    if kind_of(source) == "recording":
         yield from read_recording(source)
         return
     opened = open_source(source, config, noise=args.noise, segmentation="labels", seed=args.seed)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import pickle
 from dataclasses import fields, is_dataclass, replace
 from types import SimpleNamespace
@@ -307,15 +306,3 @@ def test_a_broken_step_is_refused_by_its_name(steps, tmp_path):
     path.unlink()
     with pytest.raises(InputError, match="the file is missing"):
         list(read_steps(run))
-
-
-def test_a_run_of_the_first_version_keeps_its_graph_and_has_no_steps(steps, tmp_path):
-    run = written(tmp_path / "run", steps[:1])
-    path = run.folder / "run.json"
-    old = json.loads(path.read_text()) | {"version": 1, "versions": {"caryatid": "0.1.0"}}
-    path.write_text(json.dumps(old))
-    (run.views[0].folder / "step.npz").unlink()
-    read = read_run(run.folder)
-    assert graph_text(read.graph) == graph_text(steps[0].graph)
-    with pytest.raises(InputError, match=r"written by caryatid 0\.1\.0, which did not store views"):
-        read_steps(read)

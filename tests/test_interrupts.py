@@ -92,7 +92,7 @@ def test_a_clearing_that_is_killed_goes_on(tmp_path):
         p.relative_to(whole.folder) for p in whole.folder.rglob("*")
     }
     run = read_run(folder)
-    for key in ("lifts", "files", "angle_travelled", "path_travelled", "views"):
+    for key in ("lifts", "angle_travelled", "path_travelled", "views"):
         assert run.record[key] == whole.record[key]
     for view, known in zip(run.views, whole.views, strict=True):
         for name in ("graph.json", "view.json", "labels.png"):

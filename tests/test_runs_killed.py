@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
+from pathlib import Path
 
-import numpy as np
 import pytest
 from conftest import SMALL, run_command
 
-from caryatid.steps import read_run
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import durability
+from durability import seed_of
 
 pytestmark = pytest.mark.slow
 
@@ -42,50 +44,19 @@ main(sys.argv[2:])
 """A command that is killed in the middle of publishing: after so many of its steps."""
 
 
-@pytest.fixture(params=["explore", "extract"])
-def words(request, tmp_path, scene_file, kept_recording):
-    """A command that writes a run of two or three views; an older run of one seed is there."""
-    command = ["explore", scene_file, "--views", 2, *SMALL] if request.param == "explore" else [
-        "extract", kept_recording,
-    ]  # fmt: skip
-    command = [*map(str, command), "--out", str(tmp_path / "runs/run"), "--quiet"]
-    assert run_command(*command, "--seed", 1) == 0
-    return command
-
-
-def seed_of(folder):
-    """The seed of a run that can be read as a whole."""
-    run = read_run(folder)
-    assert len(run.views) == len(run.record["steps"])
-    assert all(view.load_labels().any() for view in run.views)
-    return run.record["seed"]
-
-
-def check_next(folder, words):
+@pytest.mark.parametrize(("steps", "found"), [(0, 1), (1, 1), (2, 2)])
+def test_killed_while_it_gives_way(tmp_path, scene_file, steps, found):
+    folder = tmp_path / "runs/run"
+    words = ["explore", str(scene_file), "--views", "2", *SMALL, "--out", str(folder), "--quiet"]
+    assert run_command(*words, "--seed", 1) == 0
+    done = subprocess.run([sys.executable, "-c", DIES, str(steps), *words, "--seed", "2"], check=False)
+    assert done.returncode == -9
+    assert seed_of(folder) == found
     assert run_command(*words, "--seed", 3) == 0
     assert os.listdir(folder.parent) == [folder.name]
     assert seed_of(folder) == 3
 
 
-@pytest.mark.parametrize(("steps", "found"), [(0, 1), (1, 1), (2, 2)])
-def test_killed_while_it_gives_way(tmp_path, words, steps, found):
-    folder = tmp_path / "runs/run"
-    done = subprocess.run([sys.executable, "-c", DIES, str(steps), *words, "--seed", "2"], check=False)
-    assert done.returncode == -9
-    assert seed_of(folder) == found
-    check_next(folder, words)
-
-
-def test_killed_at_any_moment(tmp_path, words):
-    folder, rng = tmp_path / "runs/run", np.random.default_rng(0)
-    command = [sys.executable, "-m", "caryatid", *words, "--seed", "2"]
-    began = time.monotonic()
-    subprocess.run(command, check=True)
-    took = time.monotonic() - began
-    for moment in rng.uniform(0.3 * took, took, 6):
-        process = subprocess.Popen(command)
-        time.sleep(moment)
-        process.kill()
-        process.wait()
-        assert not folder.exists() or seed_of(folder) == 2
-    check_next(folder, words)
+def test_killed_at_any_moment(tmp_path):
+    tally = durability.kill_runs(tmp_path, durability.views_around("tower", 2), kills=12, seed=0)
+    assert tally["killed"]

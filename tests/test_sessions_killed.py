@@ -27,10 +27,9 @@ def around():
     return views_around("tower", 8)
 
 
-@pytest.mark.parametrize(("kill", "count"), [(durability.kill_adding, 8), (durability.kill_taking, 3)])
-def test_however_adding_or_taking_is_killed_nothing_is_lost(tmp_path, around, kill, count):
-    tally = kill(tmp_path, around[:count], kills=11, seed=2)
-    assert tally["kept"] + tally["not kept"] == 11
+def test_however_adding_or_taking_is_killed_nothing_is_lost(tmp_path, around):
+    tally = durability.kill_session(tmp_path, around[:6], kills=16, seed=2)
+    assert tally["kept"] + tally["not kept"] == 16
     assert tally["acknowledged"]
 
 

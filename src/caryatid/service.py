@@ -39,15 +39,16 @@ from caryatid.geometry.transforms import Array
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import read_mask
 from caryatid.io.json_files import Numbers
+from caryatid.io.log import BusyError
 from caryatid.manipulation.order import plan_order
 from caryatid.runtime.parallel import cores
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.captures import CameraRecord
 from caryatid.sessions.next_view import CandidateViews
-from caryatid.sessions.session import SessionConflictError
+from caryatid.sessions.session import SessionConflictError, is_session
 from caryatid.support.relations import Effect
 
-STATUS = {SessionConflictError: 409, PlanningError: 409, OSError: 503, MemoryError: 503}
+STATUS = {SessionConflictError: 409, BusyError: 409, PlanningError: 409, OSError: 503, MemoryError: 503}
 """Status of each error; all others are 422: the input cannot be used."""
 LATER = {"Retry-After": "1"}
 """Header of answers with status 503."""
@@ -135,7 +136,7 @@ class SessionPool:
 
     def names(self) -> list[str]:
         """Names of all sessions."""
-        return sorted(path.parent.name for path in self.folder.glob("*/session.json"))
+        return sorted(path.name for path in self.folder.glob("*") if is_session(path))
 
     def begin(self, name: str, config: Config, **options: Any) -> None:
         """Create a session; the options are those of `Session.begin`."""
@@ -149,7 +150,7 @@ class SessionPool:
 
     def session(self, name: str) -> Session:
         """Return a session, opened from disk if needed."""
-        if not (self.folder / name / "session.json").is_file():
+        if not is_session(self.folder / name):
             raise HTTPException(404, f"unknown session '{name}'; create it first")
         known = self._open.pop(name) if name in self._open else Session.open(self.folder / name)
         self._open[name] = known  # the most recently used one is the last

@@ -1,13 +1,16 @@
-"""Sources: a scene to simulate, a recording to play back, or a cloud."""
+"""What SOURCE and RUN of the command line are: a scene, a recording, a cloud, a run, a session, a graph."""
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import NoneType
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,7 +19,9 @@ from caryatid.errors import InputError, NoSurfaceError, PerceptionError, WrongVi
 from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
+from caryatid.graph import SupportGraph
 from caryatid.io.datasets import Dataset, Frame, find_sample, format_of, open_dataset
+from caryatid.io.graph_json import read_graph
 from caryatid.io.importing import choose_frames, levelled
 from caryatid.io.mask_sources import MaskSource, without_ignored
 from caryatid.io.point_clouds import read_stored_cloud
@@ -25,9 +30,11 @@ from caryatid.robots.recording import RecordingCamera, RecordingRobot
 from caryatid.scene import KEPT, LEFT_OUT
 from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import Camera
+from caryatid.sensing.voxel_map import VoxelMap
+from caryatid.sessions.session import Session, is_session
 from caryatid.simulation.scenes import is_builtin, load_scene
 from caryatid.simulation.setup import make_simulation
-from caryatid.steps import is_run, is_session
+from caryatid.steps import Run, RunWriter, is_run, read_run
 
 log = logging.getLogger(__name__)
 
@@ -49,20 +56,63 @@ class Source:
     truth: TrueScene | None = field(repr=False)
 
 
-def is_recording(source: str) -> bool:
-    """Whether SOURCE is a dataset of a known format."""
+Kind = Literal["scene", "recording", "cloud", "run", "session", "graph"]
+
+
+def kind_of(source: str) -> Kind:
+    """Return what SOURCE or RUN is; names of built-in scenes and samples come before files."""
     path = find_sample(source)
-    return path.exists() and format_of(path) is not None
+    if not is_name(source):
+        if path.suffix == ".json" and path.is_file():
+            return "graph"
+        if is_run(path):
+            return "run"
+        if is_session(path):
+            return "session"
+    if path.suffix.lower() in (".pcd", ".ply"):
+        return "cloud"
+    if is_builtin(source) or not path.exists() or format_of(path) is None:
+        return "scene"
+    return "recording"
 
 
 def is_name(source: str) -> bool:
-    """Whether SOURCE is the name of a built-in scene or a sample; names come before files."""
+    """Whether SOURCE is the name of a built-in scene or a sample."""
     return is_builtin(source) or find_sample(source) != Path(source)
 
 
-def is_cloud(source: str) -> bool:
-    """Whether SOURCE is the name of a cloud."""
-    return find_sample(source).suffix.lower() in (".pcd", ".ply")
+def read_model(path: Path) -> tuple[SupportGraph, VoxelMap | None]:
+    """Read the graph of a run, a session or a graph.json; of a session, also what it knows of space.
+
+    Raises:
+        InputError: It is none of these, or a file in it is missing or broken.
+    """
+    if path.is_file():
+        return read_graph(path), None
+    if not is_session(path):
+        return read_run(path).graph, None
+    with Session.open(path, read_only=True) as session:
+        return session.graph, session.scene.voxels
+
+
+@contextmanager
+def open_run(folder: Path) -> Iterator[Run]:
+    """Read a run; a session is replayed into one, which is deleted at the end of the `with` block.
+
+    Raises:
+        InputError: It is neither, a file in it is missing or broken, or a session has no view of a table.
+    """
+    if not is_session(folder):
+        yield read_run(folder)
+        return
+    with TemporaryDirectory() as place, Session.open(folder, read_only=True) as session:
+        b, copy = session.beginning, Path(place) / "run"
+        options = {"planner": b.planner, "robot": b.robot, "segmentation": b.segmentation}
+        about: dict[str, Any] = {"command": "session", "source": str(folder), "seed": b.seed}
+        with RunWriter(copy, b.settings, about | {"options": options}) as writer:
+            for step in session.replay():
+                writer.add(step)
+        yield replace(read_run(copy), folder=folder)
 
 
 def open_source(
@@ -95,10 +145,10 @@ def open_source(
             robot is given for a recording, or an ignore mask or `level` for a simulation.
         PlanningError: The robot cannot reach a view of the table.
     """
-    _check_no_run(source)
-    if is_cloud(source):
+    kind = _viewable(source)
+    if kind == "cloud":
         raise InputError(source, "a single cloud cannot be explored", "use `caryatid extract`")
-    if is_recording(source):
+    if kind == "recording":
         if robot != HUMANOID:
             reason = "a recording has no robot, because its camera poses are fixed"
             raise InputError(source, reason, "omit --robot")
@@ -205,11 +255,11 @@ def extract(
         InputError: The source is unknown, broken, or lacks required labels; or masks are given for a cloud.
         PerceptionError: A cloud shows no support surface.
     """
-    _check_no_run(source)
+    kind = _viewable(source)
     if is_builtin(source):
         raise InputError(source, "a scene, which has no views yet", f"use `caryatid explore {source}`")
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
-    if not is_cloud(source):
+    if kind != "cloud":
         recording = open_recording(source, config, segmentation, masks, ignore, level)
         return _look_at_all(explorer, recording)
     if masks is not None or ignore is not None:
@@ -227,23 +277,21 @@ def extract(
     return (replace(step, labels=stored.spread(step.labels)) for step in steps)
 
 
-def _check_no_run(source: str) -> None:
-    """Reject a run, a session and a graph.json; say what is used if a name comes before a file."""
-    path = Path(source)
-    if path.suffix == ".json" and path.is_file():
-        lifts, made = f"`caryatid order {source}`", f"`caryatid export {source} --out scene.xml`"
-        remedy = f"plan lifts with {lifts}, or make it a scene with {made}"
+def _viewable(source: str) -> Kind:
+    """Return the kind of a source; refuse what has no views to take, and say if a name hides a file."""
+    kind, lifts = kind_of(source), f"plan lifts with `caryatid order {source}`"
+    if kind == "graph":
+        remedy = f"{lifts}, or make it a scene with `caryatid export {source} --out scene.xml`"
         raise InputError(source, "is a graph, not a scene or recording", remedy)
-    if is_name(source):
-        if path.exists():
-            hint = "%s: using the one that comes with caryatid; for the file or folder here, write ./%s"
-            log.info(hint, source, source)
-    elif is_run(path) or is_session(path):
-        view, score, order = (f"`caryatid {command} {source}`" for command in ("view", "evaluate", "order"))
-        remedy = f"view it with {view}, score it with {score}, or plan lifts with {order}"
-        raise InputError(
-            source, f"is a {'run' if is_run(path) else 'session'}, not a scene or recording", remedy
+    if kind in ("run", "session"):
+        remedy = (
+            f"view it with `caryatid view {source}`, score it with `caryatid evaluate {source}`, or {lifts}"
         )
+        raise InputError(source, f"is a {kind}, not a scene or recording", remedy)
+    if is_name(source) and Path(source).exists():
+        hint = "%s: using the one that comes with caryatid; for the file or folder here, write ./%s"
+        log.info(hint, source, source)
+    return kind
 
 
 def _ignoring(frame: Frame, ignore: Path, max_pixels: int) -> Frame:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import io
 import json
 import platform
-import zipfile
+import re
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -39,6 +40,10 @@ AGAIN: Final = "run caryatid again"
 """Remedy for a broken file of a run."""
 PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
 """Packages whose versions run.json records."""
+OWN_FILES: Final = re.compile(
+    r"(run|graph)\.json|report\.html|lifts/\d+\.png|views/\d+/(graph\.json|view\.json|labels\.(png|npy)|step\.npz)"
+)
+"""Files of a run folder."""
 PARTS = (
     View, Cloud, ViewSphere, Candidates, Decision, PointOfInterest, Posture, RobotPose, Change, TakeStep,
     Grasp, Removal, Effect,
@@ -51,6 +56,8 @@ class RunWriter(StagedFolder):
 
     Ctrl-C also ends the block, and keeps the views so far. Any other error leaves nothing behind. An earlier
     run folder is replaced only at the end of the block. A folder with other files is never changed.
+
+    A run is what its run.json says, which is written last: what a kill leaves beside it does not count.
 
     Args:
         folder: RUN.
@@ -74,18 +81,13 @@ class RunWriter(StagedFolder):
     ) -> None:
         self._about = json.loads(json_text(dict(about) | {"settings": asdict(config)}))
         self.past = _unfinished(Path(folder), self._about) if stepwise else None
-        super().__init__(folder, replaces=_own_files, durable=stepwise, goes_on=self.past is not None)
+        super().__init__(folder, own=_own_files, published=self.past is not None)
+        record = {} if self.past is None else self.past.record
+        self.steps: list[dict[str, Any]] = [*record.get("steps", ())]
+        self._scores: list[Mapping[str, Any]] = [*record.get("scores", ())]
         self.more: dict[str, Any] = {}
         self.files: dict[str, bytes] = {}
         self._stepwise = stepwise
-        self.steps: list[dict[str, Any]] = []
-        self._graph = SupportGraph()
-        self._scores: list[Mapping[str, Any]] = []
-        if self.past is not None:
-            self.steps, self._graph = list(self.past.record["steps"]), self.past.graph
-            self._scores = list(self.past.record.get("scores", ()))
-            # Files listed for a view that a kill prevented may be missing.
-            self.written |= {name for name in self.past.record["files"] if (self._place / name).exists()}
 
     def add(self, step: Step, score: Mapping[str, Any] | None = None) -> None:
         """Write the next view, or the newest one again with its `stop`.
@@ -101,23 +103,25 @@ class RunWriter(StagedFolder):
         """
         if step.stop is not None and self.steps and self.steps[-1]["view"] == step.index:
             del self.steps[-1], self._scores[len(self.steps) :]
-        number = len(self.steps)
-        labels, folder = step.labels, _view_folder(number)
+        number, labels = len(self.steps), step.labels
         if labels.size and not 0 <= labels.min() <= labels.max() <= SUPPORT_LABEL:
             reason = f"labels are not all within 0…{SUPPORT_LABEL}"
             raise InputError(step.name, reason, "number objects from 1, 0 = no object")
-        self.write(f"{folder}/graph.json", graph_text(step.graph).encode())
-        if labels.ndim == 2:
-            self.write(f"{folder}/labels.png", images.png(labels.astype(np.uint16)))
-        else:
-            self.write(f"{folder}/labels.npy", images.npy(labels.astype(np.int32)))
         document = {"view": number, "name": step.name} | _summary(step)
-        self.write(f"{folder}/view.json", json_text(document).encode())
-        self.write(f"{folder}/step.npz", _encoded(step))
+        stored = _with_cloud(step, np.float32)
+        parts = {f.name: getattr(stored, f.name) for f in fields(stored) if f.name != "graph"}
+        graph, about = graph_text(step.graph).encode(), json_text(document).encode()
+        files = {"graph.json": graph, "view.json": about, "step.npz": images.pack(parts)}
+        if labels.ndim == 2:
+            files["labels.png"] = images.png(labels.astype(np.uint16))
+        else:
+            files["labels.npy"] = images.npy(labels.astype(np.int32))
+        for name, content in files.items():
+            self.write(f"{_view_folder(number)}/{name}", content)
         names = ("timings", "angle_travelled", "path_travelled", "stop")
         self.steps.append({"view": step.index} | {name: getattr(step, name) for name in names})
-        self._graph = step.graph
         self._scores += [] if score is None else [score]
+        self.files["graph.json"] = graph
         if self._stepwise:
             self._finish({"unfinished": True} if step.decision is not None else {})
 
@@ -137,49 +141,48 @@ class RunWriter(StagedFolder):
             raise KeyboardInterrupt(f"{count} kept in {self.folder}; {remedy}") from None
 
     def _finish(self, more: dict[str, Any]) -> None:
-        """Write the files of the whole run, and publish the folder."""
-        count = len(self.steps)
-        document = {"format": FORMAT, "version": 2, "views": count} | self._about
+        """Write the files of the whole run, run.json last, and publish the folder."""
+        document = {"format": FORMAT, "version": 2, "views": len(self.steps)} | self._about
         document["date"] = datetime.now(UTC).isoformat(timespec="seconds")
         document["versions"] = {"python": platform.python_version()} | {p: version(p) for p in PACKAGES}
         document |= {name: self.steps[-1][name] for name in ("angle_travelled", "path_travelled")}
         document["steps"] = self.steps
         document |= ({"scores": self._scores} if self._scores else {}) | self.more | more
-        self.remove(_view_folder(count))
-        for path, content in ({"graph.json": graph_text(self._graph).encode()} | self.files).items():
+        shutil.rmtree(self._partial / _view_folder(len(self.steps)), ignore_errors=True)  # of Ctrl-C
+        self.files["run.json"] = json_text(document).encode()
+        for path, content in self.files.items():
             self.write(path, content)
         self.files = {}
-        # A kill may leave files of the next view, to which nothing refers.
-        files = self.written
-        if "unfinished" in more:
-            names = ("graph.json", "labels.png", "view.json", "step.npz")
-            files = files | {lift_file(count)} | {f"{_view_folder(count)}/{name}" for name in names}
-        self.write("run.json", json_text(document | {"files": sorted(files)}).encode())
         self.publish()
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class RunView:
-    """A view of a run.
+    """A view of a run, whose files are read when needed; a missing or broken one raises `InputError`.
 
     Attributes:
-        name: The view's name, which identifies a recording's frame.
-        graph: The fused graph after this view.
-        record: All of view.json.
         folder: Its folder, `views/NN`.
     """
 
-    name: str
-    graph: SupportGraph
-    record: dict[str, Any]
     folder: Path
 
-    def load_labels(self) -> NDArray[np.int32]:
-        """Read the label image (H, W), or the labels (N,) of a cloud's points.
+    @cached_property
+    def record(self) -> dict[str, Any]:
+        """All of view.json."""
+        return read_json(self.folder / "view.json", AGAIN)
 
-        Raises:
-            InputError: The file is missing, broken or of another kind.
-        """
+    @property
+    def name(self) -> str:
+        """The view's name, which identifies a recording's frame."""
+        return parse_json(_ViewFile, self.record, self.folder / "view.json", AGAIN).name
+
+    @cached_property
+    def graph(self) -> SupportGraph:
+        """The fused graph after this view."""
+        return read_graph(self.folder / "graph.json")
+
+    def load_labels(self) -> NDArray[np.int32]:
+        """Read the label image (H, W), or the labels (N,) of a cloud's points."""
         path = self.folder / "labels.npy"
         if not path.exists():
             return images.read_units(self.folder / "labels.png")
@@ -187,6 +190,16 @@ class RunView:
         if labels.ndim != 1 or labels.dtype.kind not in "iu":
             raise InputError(path, "not an array of integers (N,)", AGAIN)
         return labels.astype(np.int32)
+
+    def load_step(self) -> Step:
+        """Read the whole step."""
+        path, remedy = self.folder / "step.npz", "explore again"
+        with read_errors(path, remedy):
+            content = path.read_bytes()
+        try:
+            return _with_cloud(Step(**images.unpack(content, PARTS), graph=self.graph), np.float64)
+        except Exception as error:  # a damaged archive raises almost anything
+            raise InputError(path, f"not a step of a run ({' '.join(str(error).split())})", remedy) from error
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -221,10 +234,10 @@ class _Score:
 
 @dataclass(frozen=True, slots=True)
 class _RunFile:
-    """run.json; version 1, of caryatid 0.1.0, has no step.npz."""
+    """run.json; runs of version 1, of caryatid 0.1.0, kept no steps."""
 
     format: Literal["caryatid/run"]
-    version: Literal[1, 2]
+    version: Literal[2]
     views: PositiveInt
     source: str
     seed: int
@@ -244,10 +257,10 @@ class _ViewFile:
 
 
 def read_run(folder: str | Path) -> Run:
-    """Read a run folder; label images are read when needed.
+    """Read a run folder; the files of its views are read when needed.
 
     Raises:
-        InputError: It is not a run folder, or a file in it is missing or broken.
+        InputError: It is not a run folder, or a file of the whole run is missing or broken.
     """
     folder = Path(folder)
     remedy = "give a run folder, as written by explore, extract or clear, or a session"
@@ -260,7 +273,7 @@ def read_run(folder: str | Path) -> Run:
     file = parse_json(_RunFile, record, path, AGAIN)
     if file.scores and len(file.scores) != file.views:
         raise InputError(path, f"the number of scores, {len(file.scores)}, is not that of views", AGAIN)
-    views = tuple(_read_view(folder / _view_folder(index)) for index in range(file.views))
+    views = tuple(RunView(folder / _view_folder(index)) for index in range(file.views))
     return Run(folder, record, read_graph(folder / "graph.json"), views)
 
 
@@ -268,14 +281,9 @@ def read_steps(run: Run) -> Iterator[Step]:
     """Read the steps of a run, one after the other.
 
     Raises:
-        InputError: A step is missing or broken, or the run was written by a version that kept no steps.
+        InputError: A step is missing or broken.
     """
-    if run.record["version"] == 1:
-        ours = run.record.get("versions", {}).get("caryatid", "0.1.0")
-        reason = f"written by caryatid {ours}, which did not store views"
-        remedy = "repeat the run; order, evaluate and export need only its graph"
-        raise InputError(run.folder, reason, remedy)
-    return (_read_step(view.folder) for view in run.views)
+    return (view.load_step() for view in run.views)
 
 
 def read_config(run: Run) -> Config:
@@ -295,11 +303,6 @@ def is_run(folder: Path) -> bool:
         return False
 
 
-def is_session(folder: Path) -> bool:
-    """Whether a folder is a session, which other commands than `caryatid session` read as a run."""
-    return (folder / "session.json").is_file()
-
-
 def _exists(folder: Path) -> bool:
     """Whether a folder exists; if a kill while it was being replaced hid it, it is restored."""
     if not folder.is_dir():
@@ -307,15 +310,9 @@ def _exists(folder: Path) -> bool:
     return folder.is_dir()
 
 
-def _own_files(folder: Path) -> set[str]:
-    """Files of a run folder that may be replaced: those that run.json lists, and those made from them."""
-    if not is_run(folder):
-        return set()
-    files = read_json(folder / "run.json").get("files")
-    if files is None:
-        reason = "contains a run of an earlier caryatid, which does not list its files"
-        raise InputError(folder, reason, "move or delete the folder, or give a new one")
-    return {"run.json", "report.html", *map(str, files)}
+def _own_files(folder: Path) -> re.Pattern[str] | None:
+    """The files of a run folder that may be replaced."""
+    return OWN_FILES if is_run(folder) else None
 
 
 def _unfinished(folder: Path, about: Mapping[str, Any]) -> Run | None:
@@ -333,13 +330,6 @@ def lift_file(index: int) -> str:
 
 def _view_folder(index: int) -> str:
     return f"views/{index:02d}"
-
-
-def _read_view(folder: Path) -> RunView:
-    path = folder / "view.json"
-    record = read_json(path, AGAIN)
-    name = parse_json(_ViewFile, record, path, AGAIN).name
-    return RunView(name, read_graph(folder / "graph.json"), record, folder)
 
 
 def _summary(step: Step) -> dict[str, Any]:
@@ -365,72 +355,6 @@ def _summary(step: Step) -> dict[str, Any]:
             quartiles = np.quantile(decision.candidate_saliency, (0.0, 0.25, 0.5, 0.75, 1.0))
             record["next"]["candidate_saliency_quartiles"] = quartiles
     return record
-
-
-def _encoded(step: Step) -> bytes:
-    """Content of step.npz: a step as JSON in the member `document`, and each larger array as a member."""
-    arrays: dict[str, NDArray[Any]] = {}
-
-    def encoded(value: Any, path: str) -> Any:
-        match value:
-            case np.ndarray() if 0 < value.size <= 16 and value.dtype == np.float64:
-                return {"$array": value.tolist()}
-            case np.ndarray():
-                arrays[path] = value
-                return {"$array": path}
-            case np.generic():
-                return value.item()
-            case Mapping():
-                return {key: encoded(item, f"{path}.{key}") for key, item in value.items()}
-            case tuple():
-                return [encoded(item, f"{path}.{number}") for number, item in enumerate(value)]
-        if isinstance(value, PARTS):
-            members = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
-            return {"$kind": type(value).__name__} | encoded(members, path)
-        return value
-
-    step = _with_cloud(step, np.float32)
-    names = [f.name for f in fields(step) if f.name != "graph"]
-    document = json.dumps({name: encoded(getattr(step, name), name) for name in names})
-    arrays["document"] = np.frombuffer(document.encode(), dtype=np.uint8)
-    buffer = io.BytesIO()
-    # Higher levels of compression take longer and save little.
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
-    return buffer.getvalue()
-
-
-def _read_step(folder: Path) -> Step:
-    """The step in a folder `views/NN`."""
-    path, remedy = folder / "step.npz", "explore again"
-    with read_errors(path, remedy):
-        content = path.read_bytes()
-    try:
-        arrays = dict(np.load(io.BytesIO(content), allow_pickle=False))
-        document = json.loads(arrays.pop("document").tobytes())
-        step = Step(**_decoded(document, arrays), graph=read_graph(folder / "graph.json"))
-        return _with_cloud(step, np.float64)
-    except Exception as error:  # a damaged archive raises almost anything
-        raise InputError(path, f"not a step of a run ({' '.join(str(error).split())})", remedy) from error
-
-
-def _decoded(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
-    """Rebuild what `_encoded` wrote."""
-    match value:
-        case {"$array": str(name)}:
-            return arrays[name]
-        case {"$array": numbers}:
-            return np.array(numbers)
-        case {"$kind": kind, **members}:
-            (part,) = (part for part in PARTS if part.__name__ == kind)
-            return part(**_decoded(members, arrays))
-        case dict():
-            return {key: _decoded(item, arrays) for key, item in value.items()}
-        case list():
-            return tuple(_decoded(item, arrays) for item in value)
-    return value
 
 
 def _with_cloud(step: Step, dtype: type[np.floating[Any]]) -> Step:

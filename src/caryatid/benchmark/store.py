@@ -1,4 +1,4 @@
-"""Results on disk: one JSON line per finished episode, appended and synced, and the code behind them."""
+"""Results on disk: a log with a line per finished episode, and the code behind them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import re
 import subprocess
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Self
-
-from filelock import FileLock, Timeout
+from typing import TYPE_CHECKING, Any, Self
 
 from caryatid.benchmark.episodes import MEASURES, Episode, Outcome
 from caryatid.errors import InputError, needs_extra
 from caryatid.io.json_files import parse_json
+from caryatid.io.log import Log
 from caryatid.runtime import LIBRARIES
 
 if TYPE_CHECKING:
@@ -57,10 +57,10 @@ class _Done:
 
 
 class ResultStore:
-    """Planned and finished episodes. A line that a kill left incomplete is ignored.
+    """Planned and finished episodes: a `Log`.
 
     Args:
-        path: File of JSON lines; created by a writer.
+        path: Its file; created by a writer.
         fingerprint: Of the code that adds episodes; None only reads. Only one writer is admitted.
         about: Further facts about code and machine, kept if the file is new.
 
@@ -72,31 +72,29 @@ class ResultStore:
         self, path: Path, fingerprint: str | None = None, about: Mapping[str, str] | None = None
     ) -> None:
         self.path = path
-        self.about: dict[str, str] = {}
         self.suites: dict[str, list[Member]] = {}
         self.outcomes: dict[str, Outcome] = {}
-        self._file: BinaryIO | None = None
-        self._lock = FileLock(f"{path}.lock", timeout=0)
-        if fingerprint is None:
-            if not path.is_file():
-                raise InputError(path, "the file is missing", "run a suite first: --suite NAME")
-            self._read()
-            return
-        try:
-            self._open()
-            self._read()
-            self._begin({**(about or {}), "format": FORMAT, "fingerprint": fingerprint})
-        except BaseException:
-            self.__exit__()
-            raise
+        if fingerprint is None and not path.is_file():
+            raise InputError(path, "the file is missing", "run a suite first: --suite NAME")
+        with ExitStack() as failure:
+            self._log = failure.enter_context(Log(path, "result file", write=fingerprint is not None))
+            code = {"format": FORMAT, "fingerprint": fingerprint}
+            if fingerprint is not None and next(iter(self._log), None) is None:
+                self._log.append({"about": {**(about or {}), **code}})
+            self.about = self._read()
+            if fingerprint is not None and not code.items() <= self.about.items():
+                told = (self.about.get(name, "") for name in ("version", "commit", "fingerprint"))
+                names = " ".join(filter(None, told))
+                reason = f"results are not comparable, because the code differs ({names})"
+                remedy = "choose another --out, or omit --suite to draw them anyway"
+                raise InputError(path, reason, remedy)
+            failure.pop_all()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._file is not None:
-            self._file.close()
-        self._lock.release()
+        self._log.close()
 
     def plan(self, suite: str, members: Sequence[Member], *, retry: bool = False) -> list[Episode]:
         """Record the members of a suite, instead of an earlier plan.
@@ -105,7 +103,7 @@ class ResultStore:
             The episodes that are missing (with `retry` also those that failed), each once, in order.
         """
         if self.suites.get(suite) != list(members):
-            self._append({"suite": suite, "members": [asdict(m) for m in members]})
+            self._log.append({"suite": suite, "members": [asdict(m) for m in members]})
             self.suites[suite] = list(members)
         known = {key for key, outcome in self.outcomes.items() if outcome.error is None or not retry}
         wanted = {self._key(m.episode): m.episode for m in members}
@@ -114,7 +112,9 @@ class ResultStore:
     def add(self, episode: Episode, outcome: Outcome) -> None:
         """Append the result of an episode; an earlier success stays."""
         key = self._key(episode)
-        self._append({"key": key, "episode": asdict(episode), "rows": outcome.rows, "error": outcome.error})
+        self._log.append(
+            {"key": key, "episode": asdict(episode), "rows": outcome.rows, "error": outcome.error}
+        )
         self._keep(key, outcome)
 
     def table(self, suite: str) -> pd.DataFrame:
@@ -145,24 +145,11 @@ class ResultStore:
         if key not in self.outcomes or self.outcomes[key].error is not None:
             self.outcomes[key] = outcome
 
-    def _open(self) -> None:
-        """Lock the file against other writers, and open it."""
+    def _read(self) -> dict[str, str]:
+        """Read all lines; return the first one, about code and machine."""
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock.acquire()
-            self._file = self.path.open("ab")
-        except Timeout:
-            remedy = "wait until it finishes, or choose another --out"
-            raise InputError(self.path, "in use by another process", remedy) from None
-        except OSError as error:
-            raise InputError(self.path, f"cannot be opened ({error})", "choose another folder") from None
-
-    def _read(self) -> None:
-        content = self.path.read_bytes()
-        whole = content[: content.rfind(b"\n") + 1]
-        try:
-            about, *lines = [json.loads(line) for line in whole.splitlines()] or [{"about": {}}]
-            self.about = parse_json(dict[str, dict[str, str]], about, self.path)["about"]
+            lines = iter(self._log)
+            about = parse_json(dict[str, dict[str, str]], next(lines), self.path)["about"]
             for line in lines:
                 if "suite" in line:
                     plan = parse_json(_Plan, line, self.path)
@@ -170,28 +157,9 @@ class ResultStore:
                 else:
                     done = parse_json(_Done, line, self.path)
                     self._keep(done.key, Outcome(done.rows, done.error))
-            if not whole and (self._file is None or not b'{"about"'.startswith(content[:8])):
-                raise ValueError
-        except (ValueError, TypeError, LookupError, RecursionError, InputError):
+            return about
+        except (LookupError, StopIteration, InputError):
             raise InputError(self.path, "is not a result file", "choose another folder") from None
-        if self._file is not None and len(whole) < len(content):
-            self._file.truncate(len(whole))
-
-    def _begin(self, about: dict[str, str]) -> None:
-        """Write the first line, or refuse to add to results of other code."""
-        if not self.about:
-            self._append({"about": about})
-            self.about = about
-        elif self.about.get("format") != FORMAT or self.about["fingerprint"] != about["fingerprint"]:
-            names = " ".join(self.about[n] for n in ("version", "commit", "fingerprint") if n in self.about)
-            reason = f"results are not comparable, because the code differs ({names})"
-            raise InputError(self.path, reason, "choose another --out, or omit --suite to draw them anyway")
-
-    def _append(self, line: dict[str, Any]) -> None:
-        assert self._file is not None, "this store was opened for reading"
-        self._file.write(json.dumps(line, ensure_ascii=False).encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
 
 
 def import_pandas() -> Any:

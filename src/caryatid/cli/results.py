@@ -14,7 +14,7 @@ from caryatid.io.importing import import_recording, reasons
 from caryatid.io.staging import write_file
 from caryatid.manipulation.order import plan_order
 from caryatid.runtime.parallel import cores
-from caryatid.sessions.reading import open_run, read_model
+from caryatid.sources import open_run, read_model
 from caryatid.steps import read_config, read_steps
 from caryatid.viz.pdf import print_pdf
 from caryatid.viz.report import make_report, read_lift, render_html

@@ -32,10 +32,9 @@ from caryatid.io.mask_sources import MaskSource
 from caryatid.manipulation.clearing import clear
 from caryatid.manipulation.dismantling import SimulatedHands
 from caryatid.runtime.parallel import cores
-from caryatid.sessions.reading import open_run
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.sources import Source, extract, is_cloud, is_name, is_recording, open_source
-from caryatid.steps import RunWriter, is_run, is_session, lift_file, read_config, read_steps
+from caryatid.sources import Source, extract, is_name, kind_of, open_run, open_source
+from caryatid.steps import RunWriter, lift_file, read_config, read_steps
 from caryatid.viz.report import draw_lift
 from caryatid.viz.tables import census, count_of
 
@@ -78,7 +77,7 @@ def extract_views(command: Extract) -> None:
 
 def show_run(command: View) -> None:
     config, output, path = command.config(), command.output, Path(command.source)
-    finished = not is_name(command.source) and (is_run(path) or is_session(path))
+    finished = kind_of(command.source) in ("run", "session")
     # The page shares the interpreter with the loop: a tenth of Python's interval lets it answer at once.
     sys.setswitchinterval(0.0005)
     with closing(_open_run(command, path) if finished else _open_loop(command, config)) as page:
@@ -253,7 +252,7 @@ def _watched(name: str, config: Config, output: Output) -> Iterator[Page]:
 
 def _conditions(command: Explore | Extract | Clear) -> str:
     """Source of the segments, and noise of a simulation."""
-    simulated = not is_cloud(command.source) and not is_recording(command.source)
+    simulated = kind_of(command.source) == "scene"
     masks = command.settings.masks_from or ("simulator" if simulated else "from the source, if any")
     text = "segments: automatic" if command.segmentation == "auto" else f"masks: {masks}"
     return text if isinstance(command, Extract) or not simulated else f"{text}, noise: {command.noise}"

@@ -7,9 +7,8 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from io import BufferedRandom
 from pathlib import Path
 from typing import Self
 
@@ -28,15 +27,13 @@ class StagedFolder:
 
     Args:
         folder: The folder's final place.
-        replaces: Returns the paths of the files in an existing folder that may be replaced; a folder with
-            any other file does not change. None replaces no file.
-        durable: Wait until every file, and the folder itself, is on disk.
-        goes_on: The folder is already in its place, and files are added to it.
+        own: Returns the pattern of the files in an existing folder that may be replaced, or None; a folder
+            with any other file does not change.
+        published: The folder is already in its place, and files are added to it.
 
     Attributes:
         folder: The folder's final place.
         published: Whether it is in its place.
-        written: Paths of the files written so far.
 
     Raises:
         InputError: The place holds something that may not be replaced, or cannot be written.
@@ -46,37 +43,26 @@ class StagedFolder:
         self,
         folder: str | Path,
         *,
-        replaces: Callable[[Path], Collection[str]] | None = None,
-        durable: bool = False,
-        goes_on: bool = False,
+        own: Callable[[Path], re.Pattern[str] | None] | None = None,
+        published: bool = False,
     ) -> None:
         self.folder = Path(folder)
-        self.published = goes_on
+        self.published = published
         self._place = Path(os.path.realpath(self.folder))  # unlike `resolve`, takes a link to itself
-        self._replaces, self._durable = replaces, durable
+        self._own = own
         self._partial = _partial(self._place)
-        self._old = self._partial.with_name(f"{self._partial.name}{REPLACED}")
-        self.written: set[str] = set()
         recover(self._place)
         self._made = [parent for parent in self._place.parents if not parent.exists()]
-        if goes_on:
-            return
-        self._check_place()
-        try:
+        if not published:
+            self._check_place()
             with write_errors(self.folder):
                 self._partial.mkdir(parents=True)
-        except BaseException:
-            self.__exit__()
-            raise
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Remove an unpublished folder, and restore the one it was to replace."""
-        with suppress(OSError):
-            if self._old.exists() and not self._place.exists():
-                self._old.rename(self._place)
+        """Remove an unpublished folder."""
         shutil.rmtree(self._partial, ignore_errors=True)
         for parent in self._made:
             with suppress(OSError):
@@ -92,14 +78,9 @@ class StagedFolder:
         with write_errors(self.folder):
             path.parent.mkdir(parents=True, exist_ok=True)
             if self.published:
-                write_file(path, content, durable=self._durable)
+                write_file(path, content)
             else:
-                _write(path, content, self._durable)
-        self.written.add(name)
-
-    def remove(self, name: str) -> None:
-        """Remove a subfolder, `name` relative to the folder, if it exists."""
-        shutil.rmtree(self._partial / name, ignore_errors=True)
+                path.write_bytes(content)
 
     def publish(self) -> None:
         """Publish the folder, unless it is published; an older one is replaced if that is allowed.
@@ -110,34 +91,32 @@ class StagedFolder:
         if self.published:
             return
         self._check_place()
+        old = self._partial.with_name(f"{self._partial.name}{REPLACED}")
         with write_errors(self.folder):
-            if self._durable:
-                sync(self._partial)
             if self._place.exists():
-                self._place.rename(self._old)
-            self._partial.rename(self._place)
+                self._place.rename(old)
             try:
-                if self._durable:
-                    sync(self._place.parent)
-            except OSError:
-                self._place.rename(self._partial)
+                self._partial.rename(self._place)
+            except BaseException:
+                if old.exists():
+                    old.rename(self._place)
                 raise
         self.published = True
-        shutil.rmtree(self._old, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
 
     def _check_place(self) -> None:
         if not os.path.lexists(self._place):
             return
         remedy = "give a new folder"
-        if self._replaces:
+        if self._own:
             remedy += "; caryatid replaces only folders that it wrote"
         if not self._place.is_dir():
             raise InputError(self.folder, "already exists and is not a directory", remedy)
-        own = self._replaces(self._place) if self._replaces else ()
+        own = self._own(self._place) if self._own else None
         with write_errors(self.folder):
             for path in self._place.rglob("*"):
                 name = path.relative_to(self._place).as_posix()
-                if name not in own and (path.is_symlink() or not path.is_dir()):
+                if path.is_symlink() or not (path.is_dir() or (own and own.fullmatch(name))):
                     raise InputError(self.folder, f"already exists and contains other files ({name})", remedy)
 
 
@@ -147,25 +126,14 @@ def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
     Raises:
         InputError: It is a folder, or the disk cannot be written; nothing is left behind.
     """
-    with staged_file(path, durable=durable) as file:
-        file.write(content)
-
-
-@contextmanager
-def staged_file(path: Path, *, durable: bool = False) -> Iterator[BufferedRandom]:
-    """Open a file to write and read; it takes its place, whole, when the block ends, as with `write_file`.
-
-    Raises:
-        InputError: As `write_file`.
-    """
     if path.is_dir():
         raise InputError(path, "is a directory", "give a file")
     recover(path)
     partial = _partial(path)
     with write_errors(path):
         try:
-            with partial.open("w+b") as file:
-                yield file
+            with partial.open("wb") as file:
+                file.write(content)
             if durable:
                 sync(partial)
             partial.replace(path)
@@ -173,30 +141,6 @@ def staged_file(path: Path, *, durable: bool = False) -> Iterator[BufferedRandom
                 sync(path.parent)
         finally:
             partial.unlink(missing_ok=True)
-
-
-def remove_folder(folder: Path) -> None:
-    """Remove a folder in one step; when this returns, the removal is on disk.
-
-    Raises:
-        InputError: The disk cannot be written.
-    """
-    partial = _partial(folder)
-    with write_errors(folder):
-        folder.rename(partial)
-        sync(folder.parent)
-    shutil.rmtree(partial, ignore_errors=True)
-
-
-def remove_file(path: Path) -> None:
-    """Remove a file; when this returns, the removal is on disk.
-
-    Raises:
-        InputError: The disk cannot be written.
-    """
-    with write_errors(path):
-        path.unlink()
-        sync(path.parent)
 
 
 def recover(place: Path) -> None:
@@ -270,11 +214,5 @@ def _runs(process: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:  # it is another user's
-        return True
+        pass
     return True
-
-
-def _write(path: Path, content: bytes, durable: bool) -> None:
-    path.write_bytes(content)
-    if durable:
-        sync(path)

@@ -1,34 +1,30 @@
 """A session: a scene model in a folder, to which views are added one by one.
 
-    DIR/session.json           settings, seed, planner and robot
-    DIR/views/NNNNNN/          one view: its images, and camera.json; the record
-    DIR/reports/NNNNNN.json    an object that the robot removed or moved
-    DIR/state/NNNNNN.pickle    the scene after so many views and reports; a cache, which may be deleted
-    DIR/lock                   locked by the process that writes
+    DIR/session.jsonl          a log: the options, then a line per view, report of a change, and undo
+    DIR/views/NNNNNN.npz       one view, decoded
+    DIR/state/….pickle         the scene after some of the lines; a cache, which may be deleted
 
-Views and reports are written completely, then renamed into place; removal also starts with a rename.
+A view counts when its line is in the log, which is written after its file.
 """
 
 from __future__ import annotations
 
+import gzip
 import hashlib
-import json
+import io
 import logging
 import pickle
 import threading
-from base64 import b64encode
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
-from io import BufferedIOBase
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from annotated_types import Ge
-from filelock import FileLock, Timeout
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Base64Bytes
 
@@ -45,19 +41,10 @@ from caryatid.exploration import (
 from caryatid.geometry.transforms import Array, as_rigid
 from caryatid.graph import Change, SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
-from caryatid.io.images import png, read_mask
-from caryatid.io.json_files import Numbers, parse_json, read_json
-from caryatid.io.staging import (
-    StagedFolder,
-    read_errors,
-    recover,
-    remove_file,
-    remove_folder,
-    staged_file,
-    sync,
-    write_errors,
-    write_file,
-)
+from caryatid.io.images import pack, png, read_mask, unpack
+from caryatid.io.json_files import Numbers, parse_json
+from caryatid.io.log import LATER, Log
+from caryatid.io.staging import read_errors, recover, sync, write_errors, write_file
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, Surroundings, find_robot, view_sphere_of
@@ -65,11 +52,19 @@ from caryatid.runtime import fingerprint
 from caryatid.scene import KEPT, Scene
 from caryatid.segmentation.view_checks import described
 from caryatid.sensing.views import View
-from caryatid.sessions.captures import CameraRecord, Capture
+from caryatid.sessions.captures import Capture
 from caryatid.sessions.next_view import REFUSED, NextView, reached_candidates, table_floor
 
-FORMAT: Final = {"format": "caryatid/session", "version": 1}
-"""How session.json begins."""
+SESSION_FILE: Final = "session.jsonl"
+"""Name of the log."""
+FORMAT: Final = {"format": "caryatid/session", "version": 2}
+"""How the first line begins."""
+NO_SESSION: Final = "not a session", "create one with `caryatid session new`"
+"""Reason and remedy for another folder."""
+RESTORE: Final = "restore this file, or delete this view and all later lines from the log"
+"""Remedy for a damaged view."""
+ANOTHER_RELEASE: Final = "open it with that release, or add its views to a new session"
+"""Remedy for a session of another release."""
 
 KNOWN: Final = {
     ("builtins", "set"),
@@ -84,12 +79,13 @@ ORIGINS: Final = {"config", "geometry", "graph", "objects", "scene", "segmentati
 """Parts of caryatid whose types it may contain. No other type is restored: a foreign session runs no code."""
 
 
+def is_session(folder: Path) -> bool:
+    """Whether a folder is a session, perhaps of an earlier release."""
+    return any((folder / name).is_file() for name in (SESSION_FILE, "session.json"))
+
+
 class SessionConflictError(InputError):
     """The session is not in the state that the request expects: its folder is taken, or views differ."""
-
-
-class SessionBusyError(SessionConflictError):
-    """Another process is writing to the session."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,30 +108,23 @@ class Beginning:
     settings: Config
     ignore: Base64Bytes | None = None
 
-    def to_json(self) -> str:
-        """Return the text of session.json."""
-        document = FORMAT | {"caryatid": version("caryatid")} | asdict(self)
-        return json.dumps(document, indent=1, default=lambda image: b64encode(image).decode()) + "\n"
-
     @classmethod
-    def read(cls, path: Path) -> Beginning:
-        """Read session.json.
+    def read(cls, line: Mapping[str, Any] | None, path: Path) -> Beginning:
+        """Read the first line of a session.
 
         Raises:
             InputError: It is missing, of another format, or has settings unknown to this release.
         """
-        if not path.is_file():
-            raise InputError(path.parent, "not a session", "create one with `caryatid session new`")
-        document = read_json(path)
-        release = document.get("caryatid", "0.1.0")  # the first release did not say which it was
+        if line is None:
+            raise InputError(path.parent, *NO_SESSION)
         try:
-            if not FORMAT.items() <= document.items():
+            if not FORMAT.items() <= line.items():
                 raise InputError(path, f"wrong format, expected {FORMAT}")
-            return parse_json(cls, document, path)
+            return parse_json(cls, line, path)
         except InputError as error:
-            reason = f"created by caryatid {release}, incompatible with this release ({error.reason})"
-            remedy = "open it with that release, or add its views to a new session"
-            raise InputError(path, reason, remedy) from None
+            by = f"created by caryatid {line.get('caryatid')}"
+            reason = f"{by}, incompatible with this release ({error.reason})"
+            raise InputError(path, reason, ANOTHER_RELEASE) from None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -178,37 +167,22 @@ class Moved:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Report:
-    """Report of an object that the robot removed or moved.
+class Event:
+    """A line after the first.
 
     Attributes:
-        object: Id of the object.
-        after: Number of views before the report.
-        T: The object's motion as a rigid transform (4, 4) in the world frame, or None if it was removed.
+        kind: A view, a report that the robot removed or moved an object, or undo of the event before.
+        name: Name of the view, or id of the object.
+        number: Number of the view, which names its file.
+        digest: Digest of this file.
+        T: Camera pose (4, 4) of the view, if given; or motion (4, 4) of the object, if it was not removed.
     """
 
-    object: str
-    after: Annotated[int, Ge(0)]
+    kind: Literal["view", "report", "undo"]
+    name: str = ""
+    number: Annotated[int, Ge(0)] = 0
+    digest: str = ""
     T: Annotated[Array, Numbers(4, 4, rigid=True)] | None = None
-
-    def to_json(self) -> bytes:
-        """Return the content of its file."""
-        return (json.dumps(asdict(self), default=np.ndarray.tolist) + "\n").encode()
-
-    def apply(self, scene: Scene) -> None:
-        """Apply the report to a scene.
-
-        Raises:
-            InputError: The scene does not have the object.
-        """
-        if self.T is None:
-            scene.removed(self.object)
-        else:
-            scene.moved(self.object, self.T)
-
-
-Event = CameraRecord | Report
-"""A view, or a report."""
 
 
 class Session:
@@ -223,18 +197,28 @@ class Session:
         scene: The scene model; do not update it.
     """
 
-    def __init__(self, path: Path, beginning: Beginning, lock: FileLock | None) -> None:
+    def __init__(self, path: Path, log: Log) -> None:
         self.path = path
-        self.beginning = beginning
-        self._lock = lock
-        mask = beginning.ignore
-        most, name = beginning.settings.recording.max_pixels, f"{path / 'session.json'}: ignore"
-        self._ignored = None if mask is None else read_mask(mask, name, most)
-        if lock is not None:
-            recover(path)
-        self._events = self._kept()
-        self._first = self._decoded(0) if self._records else None
-        self.scene = self._after(self._events)
+        self._log = log
+        with ExitStack() as failure:
+            failure.callback(log.close)
+            lines = iter(log)
+            self.beginning = Beginning.read(next(lines, None), log.path)
+            self._events: list[Event] = []
+            for number, line in enumerate(lines, start=2):
+                event = parse_json(Event, line, f"{log.path}: line {number}", LATER)
+                if event.kind == "undo":
+                    del self._events[-1:]
+                else:
+                    self._events.append(event)
+            mask = self.beginning.ignore
+            most, name = self.beginning.settings.recording.max_pixels, f"{log.path}: ignore"
+            self._ignored = None if mask is None else read_mask(mask, name, most)
+            if log.writable:
+                recover(path)
+            self._first = self._read_view(self._views[0]) if self._views else None
+            self.scene = self._after(self._events)
+            failure.pop_all()
         waiting = self.scene.waiting
         self._warnings: Sequence[str] = [KEPT % "no view shows a support surface yet"] if waiting else []
 
@@ -275,23 +259,19 @@ class Session:
         folder = Path(path)
         with write_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            known = *folder.iterdir(), *folder.glob("views/*")
-            taken = any(p.name not in ("views", "lock") and p.name[0] != "." for p in known)
-        path = folder / "session.json"
+            sync(folder.resolve().parent)
+            taken = any(not p.name.startswith(SESSION_FILE) for p in folder.iterdir())
+        file = folder / SESSION_FILE
         conflict = "already contains a session or other files", "use that session, or give a new folder"
-        if taken:
+        if taken or (file.exists() and any(Log(file, "session"))):
             raise SessionConflictError(folder, *conflict)
         with ExitStack() as failure:
-            lock = failure.enter_context(_locked(folder / "lock"))
-            if path.exists():
+            log = failure.enter_context(Log(file, "session", write=True))
+            if any(log):
                 raise SessionConflictError(folder, *conflict)
-            with write_errors(folder):
-                (folder / "views").mkdir(exist_ok=True)
-            write_file(path, beginning.to_json().encode(), durable=True)
-            sync(folder.resolve().parent)
-            session = cls(folder, beginning, lock)
+            log.append(FORMAT | {"caryatid": version("caryatid")} | asdict(beginning))
             failure.pop_all()
-            return session
+            return cls(folder, log)
 
     @classmethod
     def open(cls, path: str | PathLike[str], *, read_only: bool = False) -> Session:
@@ -302,19 +282,18 @@ class Session:
             read_only: Do not write; another process may be writing to it.
 
         Raises:
-            SessionBusyError: Another process has it open for writing.
+            BusyError: Another process has it open for writing.
             InputError: The folder is not a session, or a view is broken.
         """
         folder = Path(path)
-        beginning = Beginning.read(folder / "session.json")
+        if not (folder / SESSION_FILE).is_file():
+            if is_session(folder):
+                raise InputError(folder, "is a session of an earlier caryatid", ANOTHER_RELEASE)
+            raise InputError(folder, *NO_SESSION)
         if read_only:
-            with suppress(InputError):  # a writer may have undone a view just now
-                return cls(folder, beginning, None)
-            return cls(folder, beginning, None)
-        with ExitStack() as failure:
-            session = cls(folder, beginning, failure.enter_context(_locked(folder / "lock")))
-            failure.pop_all()
-            return session
+            with suppress(InputError):  # a writer may have replaced an undone view just now
+                return cls(folder, Log(folder / SESSION_FILE, "session"))
+        return cls(folder, Log(folder / SESSION_FILE, "session", write=not read_only))
 
     def __enter__(self) -> Self:
         return self
@@ -323,19 +302,17 @@ class Session:
         self.close()
 
     def close(self) -> None:
-        """Release the lock, so that other processes can write."""
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
+        """Let other processes write."""
+        self._log.close()
 
     @property
-    def _records(self) -> list[CameraRecord]:
-        return [event for event in self._events if isinstance(event, CameraRecord)]
+    def _views(self) -> list[Event]:
+        return [event for event in self._events if event.kind == "view"]
 
     @property
     def views(self) -> int:
         """Number of views."""
-        return len(self._records)
+        return len(self._views)
 
     @property
     def reports(self) -> int:
@@ -361,24 +338,28 @@ class Session:
             PerceptionError: It has no readings; the session does not change.
         """
         self._check_writable()
-        capture = Capture.of(view) if isinstance(view, View) else view
-        record = capture.record
+        if isinstance(view, Capture):
+            view = view.decode(self.beginning.settings.recording.max_pixels)
+        view = view if self._ignored is None else replace(view, ignored=self._ignored)
+        content = pack(replace(view, name=""))
+        name = view.name.encode(errors="replace").decode()  # that of a file may not be text
+        event = Event("view", name, self.views, hashlib.sha256(content).hexdigest(), view.T_world_camera)
         if number is not None and number != self.views:
-            if not 0 <= number == self.views - 1 or record.digest != self._records[-1].digest:
+            if not 0 <= number == self.views - 1 or event.digest != self._views[-1].digest:
                 reason = f"has number {number}, but the next view is {self.views}"
-                raise SessionConflictError(record.name, reason)
+                raise SessionConflictError(view.name, reason)
             return self._added()
-        decoded = self._decode(capture)
-        self._check_alike(decoded)
+        self._check_alike(view)
         scene = self.scene.copy()
         with _collected_warnings() as warnings:
-            graph_text(scene.update(decoded))  # reject a view whose graph cannot be written
-        with StagedFolder(self._folder(self.views), durable=True) as folder:
-            for name, content in capture.files().items():
-                folder.write(name, content)
-            folder.publish()
-        self._keep(record, scene)
-        self._first = self._first or decoded
+            graph_text(scene.update(view))  # reject a view whose graph cannot be written
+        path = self._file(event)
+        with write_errors(self.path):
+            path.parent.mkdir(exist_ok=True)
+            sync(self.path)
+        write_file(path, content, durable=True)
+        self._keep(event, scene)
+        self._first = self._first or view
         self._warnings = warnings
         return self._added()
 
@@ -399,25 +380,21 @@ class Session:
             InputError: The object is unknown, or T is not a rigid transform; the session does not change.
         """
         self._check_writable()
-        report = Report(object_id, self.views, None if T is None else as_rigid(T, "T"))
+        event = Event("report", object_id, T=None if T is None else as_rigid(T, "T"))
         if number is not None and number != self.reports:
-            newest = self._events[-1] if 0 <= number == self.reports - 1 else None
-            if not isinstance(newest, Report) or newest.to_json() != report.to_json():
+            if not 0 <= number == self.reports - 1 or _told(self._events[-1]) != _told(event):
                 reason = f"has number {number}, but the next report is {self.reports}"
                 raise SessionConflictError("report", reason)
             return self.graph
         scene = self.scene.copy()
-        report.apply(scene)
+        self._apply(event, scene)
         graph_text(scene.graph)
-        with write_errors(self.path):
-            (self.path / "reports").mkdir(exist_ok=True)
-            sync(self.path)
-        write_file(self._report(self.reports), report.to_json(), durable=True)
-        self._keep(report, scene)
+        self._keep(event, scene)
         return self.graph
 
     def _keep(self, event: Event, scene: Scene) -> None:
-        """Continue with a scene that was updated with an event, which is on disk."""
+        """Log an event, and continue with the scene after it."""
+        self._log.append(asdict(event))
         self._events.append(event)
         self.scene = scene
         self._write_snapshot(scene, self._events)
@@ -444,8 +421,8 @@ class Session:
         sphere, robot = self.scene.sphere, None
         if sphere is None:
             raise PlanningError("no view shows a table top yet; add one that does")
-        poses = [record.T_world_camera for record in self._records]
-        T_world_cameras = np.stack([self.scene.T_world_cameras[0] if T is None else T for T in poses])
+        first = self.scene.T_world_cameras[0]
+        T_world_cameras = np.stack([first if event.T is None else event.T for event in self._views])
         if candidates is not None:
             reachable = given_candidates(candidates, path_length, T_world_cameras[-1], sphere)
         else:
@@ -464,7 +441,7 @@ class Session:
         state = PlanningState(
             self.scene.graph, sphere, self.scene.voxels, visited, reachable, self.scene.config.active
         )
-        reports = [number for number, event in enumerate(self._events, start=1) if isinstance(event, Report)]
+        reports = [number for number, event in enumerate(self._events, start=1) if event.kind == "report"]
         stop = used_up(len(self._events) - max(reports, default=0), state.config)
         stop = stop or reason_to_stop(state, self.scene.changed, planner, decision)
         return NextView(self.views, decision, stop)
@@ -475,19 +452,18 @@ class Session:
         Raises:
             InputError: No view shows a support surface, or a view is broken.
         """
-        b, number, newest = self.beginning, 0, None
+        b, newest = self.beginning, None
         explorer = Explorer(config=b.settings, segmentation=b.segmentation, seed=b.seed)
         scene = explorer.scene
         for event in self._events:
-            if isinstance(event, Report):
-                event.apply(scene)
+            if event.kind == "report":
+                self._apply(event, scene)
                 continue
             with suppress(NoSurfaceError):  # the view is kept until a later one shows the surface
-                for step in explorer.looks(self._decoded(number)):
+                for step in explorer.looks(self._read_view(event)):
                     if newest is not None:
                         yield newest
                     newest = step
-            number += 1
         if newest is None:
             raise InputError(self.path, "no view shows a table top yet", "add one that does")
         reported = "; ".join(str(change) for change in scene.changes if change.view == scene.views)
@@ -508,12 +484,9 @@ class Session:
             raise SessionConflictError(self.path, "has nothing to undo", "add a view first")
         left = self._events[:-1]
         scene = self._after(left)
-        if isinstance(self._events[-1], Report):
-            remove_file(self._report(len(left) - self.views))
-        else:
-            remove_folder(self._folder(self.views - 1))
+        self._log.append(asdict(Event("undo")))
         self._events, self.scene, self._warnings = left, scene, []
-        self._first = self._first if self._records else None
+        self._first = self._first if self.views else None
         return self.views
 
     def _added(self) -> Added:
@@ -522,7 +495,7 @@ class Session:
         return Added(self.views - 1, self.graph, scene.changed, pose, warnings, changes)
 
     def _check_writable(self) -> None:
-        if self._lock is None:
+        if not self._log.writable:
             raise InputError(self.path, "is closed or read-only", "open it for writing")
 
     def _check_alike(self, view: View) -> None:
@@ -538,111 +511,73 @@ class Session:
             reason = f"its camera has {described(view)}, but that of earlier views has {described(first)}"
             raise InputError(view.name, reason, "use the same camera, or create a new session")
 
-    def _folder(self, number: int) -> Path:
-        return self.path / "views" / f"{number:06d}"
+    def _file(self, event: Event) -> Path:
+        return self.path / f"views/{event.number:06d}.npz"
 
-    def _report(self, number: int) -> Path:
-        return self.path / "reports" / f"{number:06d}.json"
+    def _read_view(self, event: Event) -> View:
+        """Read a view.
 
-    def _kept(self) -> list[Event]:
-        folders, reported = _numbered(self.path / "views"), self.path / "reports"
-        files = _numbered(reported) if reported.exists() else []
-        for found, place, what in ((folders, self._folder, "view"), (files, self._report, "report")):
-            for number, path in enumerate(found):
-                if path != place(number):
-                    remedy = "restore it, or delete the later ones"
-                    raise InputError(path.parent, f"{what} {number:06d} is missing", remedy)
-        records = [CameraRecord.read(folder / "camera.json") for folder in folders]
-        remedy = "delete this report and all later ones from the session folder"
-        reports = [parse_json(Report, read_json(path, remedy), path, remedy) for path in files]
-        if self._lock is not None and any(report.after > len(records) for report in reports):
-            reason, remedy = "some belong to missing views", "restore these views, or delete these reports"
-            raise InputError(self.path / "reports", reason, remedy)
-        events: list[Event] = []
-        # Reports of views that another process has just added are left to the next reader.
-        for number in range(len(records) + 1):
-            events += [report for report in reports if report.after == number]
-            events += records[number : number + 1]
-        return events
+        Raises:
+            InputError: Its file is missing, or has changed.
+        """
+        path = self._file(event)
+        with read_errors(path, RESTORE):
+            content = path.read_bytes()
+        if hashlib.sha256(content).hexdigest() != event.digest:
+            raise InputError(path, "has changed since it was written", RESTORE)
+        view: View = unpack(content, (View,))
+        return replace(view, name=event.name)
 
-    def _decoded(self, number: int) -> View:
-        return self._decode(Capture.read(self._folder(number)))
-
-    def _decode(self, capture: Capture) -> View:
-        view = capture.decode(self.beginning.settings.recording.max_pixels)
-        return view if self._ignored is None else replace(view, ignored=self._ignored)
+    def _apply(self, event: Event, scene: Scene) -> None:
+        if event.kind == "view":
+            scene.update(self._read_view(event))
+        elif event.T is None:
+            scene.removed(event.name)
+        else:
+            scene.moved(event.name, event.T)
 
     def _after(self, events: Sequence[Event]) -> Scene:
         """The scene after some events, from the newest usable snapshot and what came after it."""
         b = self.beginning
         done, scene = self._read_snapshot(events)
         scene = scene or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
-        views = sum(isinstance(event, CameraRecord) for event in events[:done])
-        for number, event in enumerate(events[done:], start=done):
-            if isinstance(event, Report):
-                event.apply(scene)
-            else:
-                scene.update(self._decoded(views))
-                views += 1
-            if self._lock is not None:
-                self._write_snapshot(scene, events[: number + 1])
+        for number, event in enumerate(events[done:], start=done + 1):
+            self._apply(event, scene)
+            if self._log.writable:
+                self._write_snapshot(scene, events[:number])
         return scene
 
     def _read_snapshot(self, events: Sequence[Event]) -> tuple[int, Scene | None]:
         """The newest snapshot that this code made of the first of these events, and their number."""
         for number in range(len(events), 0, -1):
             # A damaged file may raise anything, and the events are still there.
-            with suppress(Exception), self._snapshot(number).open("rb") as file:
-                if file.read(32) == self._seal(events[:number], file):
-                    file.seek(32)
-                    scene = _Unpickler(file).load()
-                    if isinstance(scene, Scene):
-                        return number, scene
+            with suppress(Exception):
+                content = gzip.decompress(self._snapshot(events[:number]).read_bytes())
+                scene = _Unpickler(io.BytesIO(content)).load()
+                if isinstance(scene, Scene):
+                    return number, scene
         return 0, None
 
     def _write_snapshot(self, scene: Scene, events: Sequence[Event]) -> None:
-        """Keep the scene of all events and the seven before it; a failure costs only time."""
+        """Keep the scene of all events, and of up to seven less, for undo; a failure costs only time."""
         with suppress(Exception):
-            path = self._snapshot(len(events))
+            path = self._snapshot(events)
             path.parent.mkdir(exist_ok=True)
-            with staged_file(path) as file:
-                file.write(bytes(32))
-                pickle.dump(scene, file, protocol=5)
-                file.seek(32)
-                seal = self._seal(events, file)
-                file.seek(0)
-                file.write(seal)
-            kept = {self._snapshot(len(events) - back) for back in range(8)}
+            # Not compressed; gzip has the checksum.
+            write_file(path, gzip.compress(pickle.dumps(scene, protocol=5), compresslevel=0))
+            kept = {self._snapshot(events[: len(events) - back]) for back in range(8)}
             for older in set(path.parent.iterdir()) - kept:
                 older.unlink()
 
-    def _snapshot(self, events: int) -> Path:
-        return self.path / "state" / f"{events:06d}.pickle"
-
-    def _seal(self, events: Sequence[Event], file: BufferedIOBase) -> bytes:
-        """Digest of the code and the events that made a snapshot, and of the rest of its file."""
-        told = (e.digest if isinstance(e, CameraRecord) else e.to_json().decode() for e in events)
-        made_of = " ".join((fingerprint(), self.beginning.to_json(), *told))
-        digest = hashlib.sha256(made_of.encode() + b"\0")
-        return hashlib.file_digest(file, lambda: digest).digest()
+    def _snapshot(self, events: Sequence[Event]) -> Path:
+        """File of the scene after these events, named by them and the code that made it."""
+        made_of = " ".join((fingerprint(), repr(self.beginning), *map(_told, events)))
+        return self.path / "state" / f"{hashlib.sha256(made_of.encode()).hexdigest()}.pickle"
 
 
-def _numbered(folder: Path) -> list[Path]:
-    """The numbered files and folders in a folder, in order."""
-    with read_errors(folder, "restore this folder"):
-        return sorted(p for p in folder.iterdir() if p.name[0].isdigit())
-
-
-def _locked(path: Path) -> FileLock:
-    """Lock out other writers until the lock is released or this process ends."""
-    lock = FileLock(path, timeout=0, thread_local=False)
-    with write_errors(path):
-        try:
-            lock.acquire()
-        except Timeout:
-            remedy = "wait until it finishes, or stop it"
-            raise SessionBusyError(path.parent, "in use by another process", remedy) from None
-    return lock
+def _told(event: Event) -> str:
+    """What tells an event from others."""
+    return event.digest or f"{event.name} {None if event.T is None else event.T.tolist()}"
 
 
 class _Unpickler(pickle.Unpickler):
