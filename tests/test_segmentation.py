@@ -19,7 +19,7 @@ from caryatid.geometry.shapes import Cylinder
 from caryatid.sensing.clouds import oriented_points, thin
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.simulation.generation import _bowl
+from caryatid.simulation.generation import bowl
 from caryatid.simulation.world import Body, build_spec, scene_from_spec
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -147,9 +147,9 @@ def with_colours(view, rgb):
 @pytest.mark.parametrize("tint", [(200, 200, 200), (215, 170, 130)], ids=["plain", "reflecting the table"])
 @pytest.mark.parametrize("elevation", [30.0, 40.0])
 def test_a_bowl_is_one_object_around_the_can_that_parts_its_inside(elevation, tint):
-    bowl = _bowl(np.random.default_rng(0)).moved(transforms.rigid(np.eye(3), (0.0, 0.0, TABLE)))
+    dish = bowl(np.random.default_rng(0)).moved(transforms.rigid(np.eye(3), (0.0, 0.0, TABLE)))
     can = Cylinder(transforms.rigid(np.eye(3), (0.0, 0.0, TABLE + 0.065)), 0.03, 0.106)
-    scene = scene_from_spec(build_spec([Body(bowl), Body(can)], "test"), "test", "test")
+    scene = scene_from_spec(build_spec([Body(dish), Body(can)], "test"), "test", "test")
     view = SimulatedCamera(scene, "carmine").capture(from_the_side(0.0, elevation, distance=0.9))
     points, normals, pixels = oriented_points(view, CloudConfig())
     outside = np.zeros(view.depth.size, dtype=bool)

@@ -182,7 +182,11 @@ class RunView:
         return read_graph(self.folder / "graph.json")
 
     def load_labels(self) -> NDArray[np.int32]:
-        """Read the label image (H, W), or the labels (N,) of a cloud's points."""
+        """Read the label image (H, W), or the labels (N,) of a cloud's points.
+
+        Raises:
+            InputError: The file is missing or broken.
+        """
         path = self.folder / "labels.npy"
         if not path.exists():
             return images.read_units(self.folder / "labels.png")
@@ -192,7 +196,11 @@ class RunView:
         return labels.astype(np.int32)
 
     def load_step(self) -> Step:
-        """Read the whole step."""
+        """Read the whole step.
+
+        Raises:
+            InputError: The file is missing or broken.
+        """
         path, remedy = self.folder / "step.npz", "explore again"
         with read_errors(path, remedy):
             content = path.read_bytes()
