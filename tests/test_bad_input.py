@@ -303,7 +303,7 @@ def test_a_fault_of_our_own_is_one_line_too_and_debug_shows_it(tmp_path, scene_f
     def broken(*_, **__):
         raise ZeroDivisionError("division by\nzero")
 
-    monkeypatch.setattr("caryatid.sources.open_source", broken)
+    monkeypatch.setattr("caryatid.cli.run.open_source", broken)
     command = ["explore", scene_file, "--out", tmp_path / "run", *SMALL]
     assert run_command(*command) == 1
     said = capsys.readouterr().err
