@@ -554,7 +554,7 @@ def test_a_pose_that_is_slightly_off_is_not_a_jump(begun, views):
 
 
 def test_a_view_comes_back_bit_by_bit(folder, views, monkeypatch, caplog):
-    caplog.set_level("CRITICAL")  # pytest's workers cannot send a warning with such a name
+    caplog.set_level("CRITICAL", "caryatid")  # pytest's workers cannot send a warning with such a name
     rng = np.random.default_rng(0)
     rgb = rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)
     normals = rng.random((120, 160, 3), np.float32)
