@@ -40,6 +40,6 @@ def print_pdf(html: str) -> bytes:
             subprocess.run([program, *options, page.as_uri()], check=True, capture_output=True, timeout=120.0)
             return printed.read_bytes()
         except (OSError, subprocess.SubprocessError) as error:
-            told = (getattr(error, "stderr", b"") or str(error).encode()).decode(errors="replace")
-            reason = f"was not printed by {program} ({told.strip().splitlines()[-1]})"
+            told = (getattr(error, "stderr", None) or b"").decode(errors="replace").strip() or str(error)
+            reason = f"was not printed by {program} ({told.splitlines()[-1]})"
             raise InputError("the PDF", reason, "print report.html from a browser") from error
