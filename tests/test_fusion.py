@@ -20,7 +20,8 @@ from synthetic import (
 from caryatid.config import FusionConfig
 from caryatid.geometry.shapes import Box
 from caryatid.graph import Support, SupportGraph
-from caryatid.objects.fusion import changed, fuse, fused_graph, match, merged_sightings
+from caryatid.objects.fusion import changed, fuse, fused_graph
+from caryatid.paper import match, merge_sightings, unite_graphs
 
 SG, PC, BOTH = (FusionConfig(method=m) for m in ("sg", "pc", "pc+sg"))
 CRATE = box((0.0, 0.0, 0.8), (0.1, 0.12, 0.1))
@@ -38,16 +39,17 @@ def graph(*pairs, shapes=None, certain=True):
 FULL = graph(("o0", "o1"), ("o1", "o2"))
 
 
-def together(*graphs, config=SG, same_labels=True):
+def together(*graphs, config=SG):
     """All graphs with the ids of the fused objects."""
     found = ()
     for g in graphs:
-        found, _ = fuse(found, g, config, same_labels=same_labels)
+        found, _ = fuse(found, g, whole=config.method == "sg")
     return found
 
 
-def fused_of(*graphs, config=SG, same_labels=True, **counts):
-    return fused_graph(together(*graphs, config=config, same_labels=same_labels), config, **counts)
+def fused_of(*graphs, config=SG, **counts):
+    derive = unite_graphs if config.method == "sg" else fused_graph
+    return derive(together(*graphs, config=config), config, **counts)
 
 
 def shift(x):
@@ -86,17 +88,17 @@ def on_its_side(shape):
     ],
 )
 def test_place_size_and_orientation_tell_whether_two_are_the_same(known, seen, same):
-    assert match([thing(1, known)], [thing(9, seen)], SG, same_labels=False) == ({"o9": "o1"} if same else {})
+    assert match([thing(1, known)], [thing(9, seen)], SG) == ({"o9": "o1"} if same else {})
 
 
 def test_each_is_matched_to_one_and_all_together_as_well_as_can_be():
     first, second = CRATE, CRATE.moved(shift(0.04))
     known = [thing(1, first), thing(2, second)]
     seen = [thing(7, first.moved(shift(0.018))), thing(8, second.moved(shift(0.018)))]
-    assert match(known, seen, SG, same_labels=False) == {"o7": "o1", "o8": "o2"}
-    assert len(match(known[:1], seen, SG, same_labels=False)) == 1
+    assert match(known, seen, SG) == {"o7": "o1", "o8": "o2"}
+    assert len(match(known[:1], seen, SG)) == 1
     for places in ([thing(1, BOXED), thing(2, CAN)], [thing(1, CAN), thing(2, BOXED)]):
-        found = match(places, [thing(9, CAN)], SG, same_labels=False)["o9"]
+        found = match(places, [thing(9, CAN)], SG)["o9"]
         assert {o.id: o.shape.kind for o in places}[found] == "cylinder"
 
 
@@ -105,9 +107,10 @@ def test_each_is_matched_to_one_and_all_together_as_well_as_can_be():
 
 def test_what_a_new_view_calls_otherwise_gets_its_old_name():
     other_names = graph(("o0", "o2"), ("o2", "o1"), shapes={1: CAN, 2: CRATE})
-    graphs, names = fuse(together(FULL), other_names, SG, same_labels=False)
+    names = match(FULL.objects, other_names.objects, SG)
+    graphs, names = fuse(together(FULL), other_names, names, whole=True)
     assert names == {"o0": "o0", "o1": "o2", "o2": "o1"}
-    fused = fused_graph(graphs, SG)
+    fused = unite_graphs(graphs, SG)
     assert edges(fused) == edges(FULL)
     assert [o.occurrences for o in fused.objects] == [2, 2, 2]
     assert fused["o1"].shape.kind == "box"
@@ -116,9 +119,10 @@ def test_what_a_new_view_calls_otherwise_gets_its_old_name():
 
 def test_a_new_object_gets_a_name_that_was_never_used():
     stranger = graph(("o0", "o1"), shapes={1: BALL})
-    graphs, names = fuse(together(FULL), stranger, SG, same_labels=False)
+    names = match(FULL.objects, stranger.objects, SG)
+    graphs, names = fuse(together(FULL), stranger, names, whole=True)
     assert names["o1"] == "o3"
-    fused = fused_graph(graphs, SG)
+    fused = unite_graphs(graphs, SG)
     assert [(o.id, o.label) for o in fused.objects[1:]] == [("o1", 1), ("o2", 2), ("o3", 3)]
     assert [s.pair for s in fused.supports] == [("o0", "o1"), ("o0", "o3"), ("o1", "o2")]
 
@@ -182,7 +186,7 @@ def test_an_edge_is_certain_where_a_view_was_certain_of_it():
 
 def test_a_support_that_a_view_lacks_is_doubtful():
     likely = replace(FULL, supports=tuple(replace(s, probability=1.0) for s in FULL.supports))
-    fused = fused_graph((likely, likely, graph(("o0", "o1"))), replace(SG, keep_share=0.5))
+    fused = unite_graphs((likely, likely, graph(("o0", "o1"))), replace(SG, keep_share=0.5))
     assert not fused.support("o0", "o1").doubtful
     support = fused.support("o1", "o2")
     assert support.probability == pytest.approx(2.0 / 3.0)
@@ -244,10 +248,10 @@ NONE = (False,) * 6
 
 def test_the_kind_with_most_evidence_wins():
     ball, crate = sphere((0.0, 0.0, 0.0), 0.05), box((0.0, 0.0, 0.0), (0.09, 0.09, 0.09))
-    assert merged_sightings([thing(1, ball), thing(1, crate), thing(1, crate)]).shape.kind == "box"
-    assert merged_sightings([thing(1, ball), thing(1, crate, seen=NONE)]).shape.kind == "sphere"
+    assert merge_sightings([thing(1, ball), thing(1, crate), thing(1, crate)]).shape.kind == "box"
+    assert merge_sightings([thing(1, ball), thing(1, crate, seen=NONE)]).shape.kind == "sphere"
     balls = [thing(1, sphere((x, 0.0, 0.0), radius)) for x, radius in ((0.0, 0.04), (0.02, 0.05))]
-    assert hausdorff(merged_sightings(balls).shape, sphere((0.01, 0.0, 0.0), 0.045)) < 1e-12
+    assert hausdorff(merge_sightings(balls).shape, sphere((0.01, 0.0, 0.0), 0.045)) < 1e-12
 
 
 def test_merging_commutes_with_any_motion_and_any_order():
@@ -255,7 +259,7 @@ def test_merging_commutes_with_any_motion_and_any_order():
         thing(1, box((0.0, 0.0, 0.0), (0.08, 0.12, 0.1), turn_deg=3.0 * k), seen=(True, k == 0) * 3)
         for k in range(3)
     ]
-    T, merged = random_motion(np.random.default_rng(2)), merged_sightings(sightings)
+    T, merged = random_motion(np.random.default_rng(2)), merge_sightings(sightings)
     for order in permutations(sightings):
         there = [replace(o, shape=o.shape.moved(T)) for o in order]
-        assert hausdorff(merged_sightings(there).shape, merged.shape.moved(T)) < 1e-12
+        assert hausdorff(merge_sightings(there).shape, merged.shape.moved(T)) < 1e-12

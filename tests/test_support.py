@@ -17,6 +17,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere, Uncertainty
 from caryatid.geometry.transforms import rigid
 from caryatid.graph import SceneObject, Support
+from caryatid.paper import infer_by_area
 from caryatid.support.contacts import find_contacts, find_gap
 from caryatid.support.plausibility import reconcile
 from caryatid.support.relations import explain, infer, predict_removal, removal_of
@@ -270,11 +271,11 @@ class TestInfer:
         """The plank, 36 cm × 6 cm, touches its block over 9 cm × 6 cm: r_s = 9/36 = 0.25, eq. 1."""
         objects = counterweight(load_x=0.2)
         assert ("o3", "o2") not in edges(infer(objects, CONFIG))
-        stable = infer(objects, PAPER)
+        stable = infer_by_area(objects, PAPER)
         assert stable.stability["o2"].ratio == pytest.approx(0.25)
         assert stable.stability["o2"].stable
         assert ("o3", "o2") not in edges(stable)
-        unstable = infer(objects, replace(PAPER, min_area_ratio=0.26))
+        unstable = infer_by_area(objects, replace(PAPER, min_area_ratio=0.26))
         assert edges(unstable)["o3", "o2"] == "top-down"
         assert not unstable.support("o3", "o2").certain
 
@@ -326,7 +327,7 @@ class TestInfer:
         assert known is None or explain(graph, *pair, CONFIG) == f"{known.why} Probability 1.00."
 
     def test_why_on_paper_and_of_whom_it_cannot_be_asked(self):
-        graph = infer(tower(), PAPER)
+        graph = infer_by_area(tower(), PAPER)
         assert explain(graph, "o2", "o1", PAPER).startswith("o2 does not support o1: o2 is not")
         for pair, said in ((("o1", "o9"), "not an object of the graph"), (("o1", "o1"), "itself")):
             with pytest.raises(InputError, match=said):
@@ -368,7 +369,7 @@ class TestProbabilities:
         assert set(self.likely(tower()).values()) == {1.0}
         graph = infer(tower(), CONFIG)
         assert [o.probability for o in graph.objects] == [1.0] * 5
-        assert all(s.probability is None for s in infer(tower(), PAPER).supports)
+        assert all(s.probability is None for s in infer_by_area(tower(), PAPER).supports)
 
     def test_a_counterweight_of_unknown_weight_holds_as_often_as_it_is_heavy_enough(self):
         """The plank's moment is 4.32·10⁻⁴·0.09 m⁴, the weight's 4.52·10⁻⁴·0.05 m⁴.

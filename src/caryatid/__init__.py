@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 hooks |= {
+    "scene": "caryatid.paper:choose_scene",
     "notebook cell": "caryatid.viz.notebook:draw_cell",
     "viewer": "caryatid.viewer:show",
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
 from types import NoneType
@@ -81,6 +81,12 @@ class Scene(Pictured):
         identified: Whether the labels given with the newest view are those of the objects in all views.
         timings: Time of each stage of the newest update [s].
     """
+
+    def __new__(cls, config: Config | None = None, **_: Any) -> Scene:
+        """Make a scene; `caryatid.paper` has the classes for settings of the paper."""
+        chosen = cls is Scene and isinstance(config, Config)
+        scene: Scene = object.__new__(call("scene", config) if chosen else cls)
+        return scene
 
     def __init__(
         self, config: Config | None = None, *, segmentation: SegmentationMethod | None = None, seed: int = 0
@@ -277,7 +283,7 @@ class Scene(Pictured):
             self._models.relocate(label, T)
         else:
             self._models.forget(set() if label is None else {label})
-            if T is not None:  # With `sg`, only objects of the newest view have a fit.
+            if T is not None:
                 label = self._free_label()
                 self._models.put(o.shape.moved(T), label, self.views - 1)
                 self._ids = self._ids | {label: o.id}
@@ -290,8 +296,7 @@ class Scene(Pictured):
             if known == object_id:
                 return label
         label = int(object_id[1:])
-        per_view = self.config.fusion.method == "sg" and not self.identified
-        return None if per_view or label in self._ids else label
+        return None if label in self._ids else label
 
     def _reported(self, kind: ChangeKind, object_id: str) -> None:
         """Record what the robot did, and derive the graph again."""
@@ -395,20 +400,16 @@ class Scene(Pictured):
             explained = list(new) if set(observation.shown) - new.keys() - {0, SUPPORT_LABEL} else []
             unexplained = observation.cloud.select(~np.isin(observation.labels, explained))
             check_free(unexplained, self.surface, before, self.config)
-        if not named and (given or self.config.fusion.method != "sg"):
-            known = self._models.objects()
-            if self.config.fusion.method == "sg":  # its models have the newest view's objects alone
-                known = [o for o in self.graph.objects if o.role == "object"]
-            segments = observation.labels
-            observation = self._models.associate(observation, known, masks=given, new=new.keys())
-            new = {int(observation.labels[segments == k][0]): why for k, why in new.items()}
+        if not named:
+            observation, new = self._associated(observation, given, new)
         if named and self.views:
             self._check_identity(observation, source.name)
         shown = self._models.add(observation, self.views) | moved
         self.surface = self._fused_surface(observation)
         surface, voxels = self._bounds(observation)
         watch.lap("map")
-        observation = self._fitted(observation, shown, surface, voxels, given, named)
+        below = voxels.closed_below(surface.outline_world, surface.normal_world)
+        observation = self._formed(observation, shown, surface, below, given, named)
         if not named:
             observation, new = self._reidentified(observation, new)
         watch.lap("fit")
@@ -430,7 +431,19 @@ class Scene(Pictured):
         """Whether a label identifies the same object in all views."""
         if isinstance(source, View) and source.labels_are == "segments":
             return False
-        return self.config.fusion.matching == "points" and self.config.fusion.masks == "scene"
+        return self.config.fusion.masks == "scene"
+
+    def _known(self) -> list[SceneObject]:
+        """The objects that new segments may belong to."""
+        return self._models.objects()
+
+    def _associated(
+        self, observation: Observation, given: bool, new: dict[int, str]
+    ) -> tuple[Observation, dict[int, str]]:
+        """Give segments, and those among them that are new, the labels of their objects."""
+        segments = observation.labels
+        observation = self._models.associate(observation, self._known(), masks=given, new=new.keys())
+        return observation, {int(observation.labels[segments == k][0]): why for k, why in new.items()}
 
     def _check_identity(self, observation: Observation, name: str) -> None:
         """Warn if most masks lie on objects that had other numbers in earlier masks."""
@@ -509,22 +522,16 @@ class Scene(Pictured):
         return known if fused is None else fused
 
     def _bounds(self, observation: Observation) -> tuple[SupportSurface, VoxelMap]:
-        """Add the view to the map; return the limits of hidden extents (`sg`: of this view alone)."""
+        """Add the view to the map; return the limits of hidden extents."""
         if self.sphere is None or self.voxels is None:
             centre = observation.surface.point_world
             self.sphere = ViewSphere.around(centre, self.config.active)
             self.voxels = VoxelMap.around(centre, self.config.voxels)
-        max_depth = self.config.cloud.max_depth
         if observation.view is not None:
-            self.voxels = self.voxels.integrate(observation.view, max_depth)
-        if self.config.fusion.method != "sg":
-            return self.surface or observation.surface, self.voxels
-        newest = VoxelMap.around(self.sphere.centre_world, self.config.voxels)
-        if observation.view is not None:
-            newest = newest.integrate(observation.view, max_depth)
-        return observation.surface, newest
+            self.voxels = self.voxels.integrate(observation.view, self.config.cloud.max_depth)
+        return self.surface or observation.surface, self.voxels
 
-    def _fitted(
+    def _formed(
         self,
         observation: Observation,
         shown: set[int],
@@ -534,10 +541,6 @@ class Scene(Pictured):
         named: bool,
     ) -> Observation:
         """Fit the objects this view changed; split and merge automatic segments as the shapes suggest."""
-        voxels = voxels.closed_below(surface.outline_world, surface.normal_world)
-        if self.config.fusion.method == "sg":
-            self._models.fit_newest(set(observation.shown) - {0, SUPPORT_LABEL}, voxels)
-            return observation
         self._models.fit_all(shown, voxels)
         table = observation.footprint(surface, self.config.explanation.spacing)
         if named:
@@ -552,11 +555,14 @@ class Scene(Pictured):
 
     def _renamed(self, observation: Observation, given_up: Mapping[int, int]) -> Observation:
         """Relabel objects, now and in the graphs so far: old → new."""
-        if given_up and self.config.fusion.matching == "points":
-            names = {object_id(old): object_id(new) for old, new in given_up.items()}
-            self._graphs = tuple(renamed(graph, names) for graph in self._graphs)
-            self._shown = tuple(frozenset(names.get(i, i) for i in ids) for ids in self._shown)
+        if given_up:
+            self._rename({object_id(old): object_id(new) for old, new in given_up.items()})
         return observation.relabelled(dict(given_up))
+
+    def _rename(self, names: dict[str, str]) -> None:
+        """Rename objects in the graphs so far: old → new id."""
+        self._graphs = tuple(renamed(graph, names) for graph in self._graphs)
+        self._shown = tuple(frozenset(names.get(i, i) for i in ids) for ids in self._shown)
 
     def _changes_seen(self, observation: Observation, named: bool) -> tuple[dict[str, str], dict[int, str]]:
         """Find objects that changed, and delete them before anything is added.
@@ -571,11 +577,7 @@ class Scene(Pictured):
         if view is None or voxels is None or registration is None or not registration.aligned:
             return {}, {}
         missing = self._detector.missing(view, self._surfaces())
-        new = dict[int, str]()
-        if named or self.config.fusion.method != "sg":
-            rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
-            points = observation.cloud.points_world[rows]
-            new = appeared(view.name, points, observation.labels[rows], voxels.states_around(points))
+        new = self._appeared(observation, voxels, named)
         if named:
             moved = {object_id(k): why for k, why in new.items() if k in self._models.points.objects}
             missing = moved | missing
@@ -594,10 +596,15 @@ class Scene(Pictured):
             self.voxels = self.voxels.forgotten(which & (self.voxels.hits == 0))
         return missing, new
 
+    def _appeared(self, observation: Observation, voxels: VoxelMap, named: bool) -> dict[int, str]:
+        """Labels of the segments in space that was free, each with a reason."""
+        assert observation.view is not None
+        rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
+        points = observation.cloud.points_world[rows]
+        return appeared(observation.view.name, points, observation.labels[rows], voxels.states_around(points))
+
     def _surfaces(self) -> dict[str, tuple[Array, Array]]:
-        """Points and normals of the objects by id: as seen, or with `sg` of their shapes."""
-        if self.config.fusion.method == "sg":
-            return {o.id: o.shape.surface(0.01) for o in self.graph.objects if o.role == "object"}
+        """Points and normals of the objects by id."""
         models, found = self._models.points, dict[str, tuple[Array, Array]]()
         for label in models.objects:
             cloud = models.of(label, self.config.cloud.voxel)
@@ -620,13 +627,16 @@ class Scene(Pictured):
         if self.config.completion.enabled:
             fitted = complete(fitted, surface, voxels, self.config.completion)
         table = SceneObject(SUPPORT_SURFACE_ID, SUPPORT_LABEL, surface.shape, "support_surface")
-        return infer(reconcile([table, *fitted], self.config.plausibility), self.config.support)
+        return self._supported(reconcile([table, *fitted], self.config.plausibility))
+
+    def _supported(self, objects: Sequence[SceneObject]) -> SupportGraph:
+        """The support graph of shapes."""
+        return infer(objects, self.config.support)
 
     def _fused(self, observation: Observation, newest: SupportGraph, given: bool) -> Observation:
         """Add the newest graph to the earlier ones; its labels become those of the fused objects."""
-        config = self.config.fusion
-        same_labels = config.matching == "points" and (given or config.method != "sg")
-        self._graphs, names = fuse(self._graphs, newest, config, same_labels=same_labels)
+        whole = self.config.fusion.method == "sg"
+        self._graphs, names = fuse(self._graphs, newest, self._matched(newest, given), whole=whole)
         self._ids = {int(o[1:]): n for o, n in names.items()}
         observation = observation.relabelled({k: int(n[1:]) for k, n in self._ids.items() if k != int(n[1:])})
         seen = {SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(k) for k in observation.shown}
@@ -634,9 +644,17 @@ class Scene(Pictured):
         self._set_graph(renamed(newest, names))
         return observation
 
+    def _matched(self, newest: SupportGraph, given: bool) -> dict[str, str] | None:
+        """Known ids of the newest graph's objects; None where a label means the same object in every view."""
+        return None
+
+    def _fused_graph(self) -> SupportGraph:
+        """The graph of all views."""
+        return fused_graph(self._graphs, self.config.fusion, shown=self._shown)
+
     def _set_graph(self, newest: SupportGraph) -> None:
         """Derive the fused graph from all graphs; stability is that of the newest one, with fused ids."""
-        fused = fused_graph(self._graphs, self.config.fusion, shown=self._shown)
+        fused = self._fused_graph()
         ids = {o.id for o in fused.objects}
         stability = {i: verdict for i, verdict in newest.stability.items() if i in ids}
         before, self.graph = self.graph, replace(fused, stability=stability)

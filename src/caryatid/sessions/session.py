@@ -75,7 +75,7 @@ KNOWN: Final = {
     ("numpy._core.numeric", "_frombuffer"),
 }
 """What a snapshot may contain of other packages."""
-ORIGINS: Final = {"config", "geometry", "graph", "objects", "scene", "segmentation", "sensing"}
+ORIGINS: Final = {"config", "geometry", "graph", "objects", "paper", "scene", "segmentation", "sensing"}
 """Parts of caryatid whose types it may contain. No other type is restored: a foreign session runs no code."""
 
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
-from caryatid.geometry import polygons
 from caryatid.geometry.transforms import Array
-from caryatid.graph import DOUBTFUL, LIKELY, Kind, SceneObject, Stability, Support, SupportGraph
+from caryatid.graph import DOUBTFUL, LIKELY, Kind, SceneObject, Support, SupportGraph
 from caryatid.support.contacts import Contact, find_gap
 from caryatid.support.equilibrium import moved_without, support_forces, touching
 from caryatid.support.stability import assess
@@ -80,9 +79,7 @@ def infer(
 
     An object supports another one that it touches if the forces that hold the scene at rest need it: it
     carries a share of its weight, or the other one moves without it. The probability is the share of scenes,
-    sampled from the uncertainty of shapes, friction and weights, in which it does. With `stability` = `area`,
-    the rules of the paper decide instead, and there are no probabilities: at each separating plane, the lower
-    object supports the upper one, and everything on top of an object with a small support area holds it down.
+    sampled from the uncertainty of shapes, friction and weights, in which it does.
 
     Args:
         objects: Shapes in the world frame; nothing supports the one with role `support_surface`.
@@ -98,12 +95,10 @@ def infer(
     if len({o.id for o in objects}) < len(objects):
         raise InputError("objects", "two of them have the same id", "give each object a unique id")
     ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
-    if config.stability == "area":
-        return _by_area(ordered, config)
     found = support_forces(ordered, config, rng or np.random.default_rng(0))
     supports = [
-        _support(ordered, c, config, float(found.shares[a, b]), found.forces[a, b])
-        for (a, b), c in sorted(_nearest(ordered, found.contacts).items())
+        make_support(ordered, c, config, float(found.shares[a, b]), found.forces[a, b])
+        for (a, b), c in sorted(nearest_contacts(ordered, found.contacts).items())
         if found.shares[a, b] >= LIKELY
     ]
     below = {s.pair for s in supports if s.kind == "bottom-up"}
@@ -138,7 +133,7 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
         return f"{edge.why} Probability {edge.probability:.2f}." if known else edge.why
     if graph.objects[b].role == "support_surface":
         return f"{supported} is the support surface: nothing supports it."
-    contact = _nearest(graph.objects, touching(graph.objects, config.reach)).get((a, b))
+    contact = nearest_contacts(graph.objects, touching(graph.objects, config.reach)).get((a, b))
     head = f"{supporter} does not support {supported}"
     if contact is None:
         gap = find_gap(graph.objects[a].shape, graph.objects[b].shape)
@@ -204,8 +199,10 @@ def _loss(graph: SupportGraph, object_id: str, gone: set[str]) -> str:
     return f"it loses the support of {', '.join(lost)}" if lost else "the forces on it change"
 
 
-def _nearest(objects: Sequence[SceneObject], contacts: Iterable[Contact]) -> dict[tuple[int, int], Contact]:
-    """The nearest contact of each pair (a, b) of objects, seen from a to b, which is not the surface."""
+def nearest_contacts(
+    objects: Sequence[SceneObject], contacts: Iterable[Contact]
+) -> dict[tuple[int, int], Contact]:
+    """Find the nearest contact of each pair (a, b) of objects, seen from a to b, which is not the surface."""
     nearest: dict[tuple[int, int], Contact] = {}
     for contact in contacts:
         for c in (contact, contact.reversed()):
@@ -215,31 +212,14 @@ def _nearest(objects: Sequence[SceneObject], contacts: Iterable[Contact]) -> dic
     return nearest
 
 
-def _by_area(objects: tuple[SceneObject, ...], config: SupportConfig) -> SupportGraph:
-    """The supports by the rules of the paper: separating planes and eq. 1."""
-    nearest = _nearest(objects, touching(objects, config.contact_margin))
-    below = {pair: c for pair, c in nearest.items() if c.tilt <= config.max_tilt}
-    stability: dict[str, Stability] = {}
-    supports = {pair: _support(objects, c, config) for pair, c in below.items()}
-    for k, o in enumerate(objects):
-        if o.role == "support_surface":
-            continue
-        patches = [polygons.hull(c.points_world) for (_, b), c in below.items() if b == k]
-        stability[o.id] = assess(o.shape, patches, config)
-        if not stability[o.id].stable:
-            riders = {(b, a) for a, b in below if a == k} - supports.keys()
-            supports |= {pair: _support(objects, nearest[pair], config) for pair in riders}
-    return SupportGraph(objects, tuple(supports[pair] for pair in sorted(supports)), stability)
-
-
-def _support(
+def make_support(
     objects: Sequence[SceneObject],
     contact: Contact,
     config: SupportConfig,
     share: float | None = None,
     force: Array | None = None,
 ) -> Support:
-    """The support of b by a across a contact, with a probability [1] and a force (3,) [weight of b]."""
+    """Make the support of b by a across a contact, with a probability [1] and a force (3,) [weight of b]."""
     a, b, tilt = objects[contact.a].id, objects[contact.b].id, contact.tilt
     kind: Kind = "lean" if tilt < 180.0 - config.max_tilt else "top-down"
     kind = "bottom-up" if tilt <= config.max_tilt else kind
