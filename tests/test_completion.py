@@ -107,19 +107,6 @@ def test_only_a_side_that_faces_down_is_one_to_rest_on(tilt_deg, extended):
     assert lowest(done.shape) >= TABLE_TOP - 0.001
 
 
-def test_a_front_alone_is_taken_to_be_as_deep_as_wide_within_free_space():
-    front = box((0.0, 0.0, TABLE_TOP + 0.05), (0.01, 0.08, 0.1))
-    flat = thing(1, front, seen=(True, False, False, False, False, False))
-    (deep,) = completed(flat)
-    assert deep.shape.extents[0] == pytest.approx(0.08)
-    towards_unseen = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-    ends = deep.centre_world[0] + np.array([1.0, -1.0]) * deep.shape.support(towards_unseen)
-    np.testing.assert_allclose(ends, (-0.005 + 0.08, -0.005))
-    behind_is_free = seen_free(lambda p: p[:, 0] > 0.04, CENTRE)
-    (bounded,) = completed(flat, voxels=behind_is_free)
-    assert bounded.shape.extents[0] == pytest.approx(0.045, abs=1.5 * VoxelConfig().size)
-
-
 def test_among_many_objects_it_reaches_down_to_the_first_one_in_its_way():
     reached_table = 0
     for seed in range(12):

@@ -85,8 +85,8 @@ class ViewScene(PaperScene):
         # The models have the newest view's objects alone.
         return [o for o in self.graph.objects if o.role == "object"]
 
-    def _appeared(self, observation: Observation, voxels: VoxelMap, named: bool) -> dict[int, str]:
-        return super()._appeared(observation, voxels, named) if named else {}
+    def _appeared(self, observation: Observation, voxels: VoxelMap) -> dict[int, str]:
+        return super()._appeared(observation, voxels) if self.identified else {}
 
     def _bounds(self, observation: Observation) -> tuple[SupportSurface, VoxelMap]:
         """Add the view to the map; return the limits of hidden extents, of this view alone."""
@@ -104,7 +104,6 @@ class ViewScene(PaperScene):
         surface: SupportSurface,
         voxels: VoxelMap,
         given: bool,
-        named: bool,
     ) -> Observation:
         self._models.fit_newest(set(observation.shown) - {0, SUPPORT_LABEL}, voxels)
         return observation

@@ -391,10 +391,10 @@ class Scene(Pictured):
         if not self.views:
             check_size(source.name, observation.surface, self.config.surface)
         watch.lap("segment")
-        observation, moved = self._registered(observation, named)
+        observation, moved = self._registered(observation)
         watch.lap("register")
         before = self.voxels
-        missing, new = self._changes_seen(observation, named)
+        missing, new = self._changes_seen(observation)
         if self.surface and before and self._registration and observation.view:
             # If everything it shows had changed, the pose would be wrong instead.
             explained = list(new) if set(observation.shown) - new.keys() - {0, SUPPORT_LABEL} else []
@@ -409,7 +409,7 @@ class Scene(Pictured):
         surface, voxels = self._bounds(observation)
         watch.lap("map")
         below = voxels.closed_below(surface.outline_world, surface.normal_world)
-        observation = self._formed(observation, shown, surface, below, given, named)
+        observation = self._formed(observation, shown, surface, below, given)
         if not named:
             observation, new = self._reidentified(observation, new)
         watch.lap("fit")
@@ -483,7 +483,7 @@ class Scene(Pictured):
                 remedy = "no mask covers them" if masks else "move closer, or give a larger image or masks"
                 log.warning("%s: %d points above the table belong to no object; %s", name, over.sum(), remedy)
 
-    def _registered(self, observation: Observation, named: bool) -> tuple[Observation, set[int]]:
+    def _registered(self, observation: Observation) -> tuple[Observation, set[int]]:
         """Register the view to the earlier ones, and correct their poses too.
 
         Returns:
@@ -499,7 +499,7 @@ class Scene(Pictured):
             registration = ViewRegistration(observation.surface.point_world, config.registration)
         else:
             registration = self._registration.copy()
-        moves = registration.add(observation.cloud, same_labels=named)
+        moves = registration.add(observation.cloud, same_labels=self.identified)
         observation = observation.moved(moves.pop(self.views))
         seen = self._models.points.of(SUPPORT_LABEL)
         if (
@@ -538,12 +538,11 @@ class Scene(Pictured):
         surface: SupportSurface,
         voxels: VoxelMap,
         given: bool,
-        named: bool,
     ) -> Observation:
         """Fit the objects this view changed; split and merge automatic segments as the shapes suggest."""
         self._models.fit_all(shown, voxels)
         table = observation.footprint(surface, self.config.explanation.spacing)
-        if named:
+        if self.identified:
             self._models.form(shown, voxels, table)
             return observation
         changed = set() if given else self._models.divide(shown, voxels)
@@ -564,7 +563,7 @@ class Scene(Pictured):
         self._graphs = tuple(renamed(graph, names) for graph in self._graphs)
         self._shown = tuple(frozenset(names.get(i, i) for i in ids) for ids in self._shown)
 
-    def _changes_seen(self, observation: Observation, named: bool) -> tuple[dict[str, str], dict[int, str]]:
+    def _changes_seen(self, observation: Observation) -> tuple[dict[str, str], dict[int, str]]:
         """Find objects that changed, and delete them before anything is added.
 
         Only a registered view can show a change: an error of its pose looks the same.
@@ -577,8 +576,8 @@ class Scene(Pictured):
         if view is None or voxels is None or registration is None or not registration.aligned:
             return {}, {}
         missing = self._detector.missing(view, self._surfaces())
-        new = self._appeared(observation, voxels, named)
-        if named:
+        new = self._appeared(observation, voxels)
+        if self.identified:
             moved = {object_id(k): why for k, why in new.items() if k in self._models.points.objects}
             missing = moved | missing
         for id_ in missing:
@@ -596,7 +595,7 @@ class Scene(Pictured):
             self.voxels = self.voxels.forgotten(which & (self.voxels.hits == 0))
         return missing, new
 
-    def _appeared(self, observation: Observation, voxels: VoxelMap, named: bool) -> dict[int, str]:
+    def _appeared(self, observation: Observation, voxels: VoxelMap) -> dict[int, str]:
         """Labels of the segments in space that was free, each with a reason."""
         assert observation.view is not None
         rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))

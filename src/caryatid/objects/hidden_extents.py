@@ -32,8 +32,8 @@ def complete(
     """Extend the unseen lower side of each object until it meets free space, another shape or the table.
 
     Before, unseen upper sides, whose points end only in the shadow of what lies above, are extended to it
-    where that is likelier than not. An object with a single seen side is taken to be as deep as it is wide,
-    within the same bounds. Objects are extended from the lowest up, so that those below are complete.
+    where that is likelier than not. Objects are extended from the lowest up, so that those below are
+    complete.
 
     Args:
         objects: Objects without the support surface; `seen` says which sides points confirm.
@@ -46,7 +46,7 @@ def complete(
     lowest = [o.shape.surface(SPACING)[0][:, 2].min() for o in objects]
     for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
         others = [o.shape for n, o in enumerate(done) if n != k]
-        done[k] = _extended(done[k], others, surface, voxels, config)
+        done[k] = _extend_downwards(done[k], others, surface, voxels, config)
     return done
 
 
@@ -90,81 +90,42 @@ def _variance(shown: float, room: float, put: float) -> float:
     return float(v * (w - v) - 2.0 * v * at * np.log(w / v) + at**2 * (w - v) / w + (w - at) ** 2 * v / w)
 
 
-def _extended(
+def _extend_downwards(
     candidate: SceneObject,
     others: Sequence[Shape],
     surface: SupportSurface,
     voxels: VoxelMap,
     config: CompletionConfig,
 ) -> SceneObject:
-    """Extend an object among the shapes of the others."""
+    """Extend an object's unseen lower side down to the table, another shape or free space."""
     shape = candidate.shape
     if isinstance(shape, Sphere):
         return candidate
     axis, sign = _downward_side(shape)
     down_world = sign * shape.T_world_object[:3, axis]
     upright = -down_world[2] >= np.cos(np.radians(config.max_tilt))
-    if upright and not candidate.seen[2 * axis + (sign > 0)]:
-        bottom = _face(shape, axis, sign)
-        lowest = float(surface.height(bottom[0]).min())
-        to_table = lowest / -float(down_world @ surface.normal_world)
-        if to_table <= 0.0:
-            candidate = replace(candidate, shape=_lengthened(shape, axis, sign, to_table))
-        else:
-            aim = "down to the table"
-            candidate = _moved_out(candidate, (axis, sign), bottom, to_table, aim, others, voxels, config)
-    hidden = _depth_side(candidate)
-    if hidden is None or (upright and hidden[0] == axis):
+    if not upright or candidate.seen[2 * axis + (sign > 0)]:
         return candidate
-    extents = candidate.shape.extents
-    guess = float(np.delete(extents, hidden[0]).min()) - float(extents[hidden[0]])
-    back = _face(candidate.shape, *hidden)
-    return _moved_out(candidate, hidden, back, guess, "as deep as it is wide", others, voxels, config)
-
-
-def _moved_out(
-    candidate: SceneObject,
-    side: tuple[int, float],
-    face: Face,
-    limit: float,
-    aim: str,
-    others: Sequence[Shape],
-    voxels: VoxelMap,
-    config: CompletionConfig,
-) -> SceneObject:
-    """Move a side (axis, sign) outwards up to a limit [m], another shape or free space."""
-    if limit < LEAST:
-        return candidate
-    (axis, sign), (points, rim) = side, face
-    outward = sign * candidate.shape.T_world_object[:3, axis]
-    across = np.delete(candidate.shape.T_world_object[:3, :3], axis, axis=1)
-    length, reason = limit, f"is assumed to reach {aim}"
+    points, rim = _face(shape, axis, sign)
+    length = float(surface.height(points).min()) / -float(down_world @ surface.normal_world)
+    if length <= 0.0:
+        return replace(candidate, shape=_lengthened(shape, axis, sign, length))
+    reason = "is assumed to reach down to the table"
+    across = np.delete(shape.T_world_object[:3, :3], axis, axis=1)
     # What lies beside the shape may overlap its walls by as much as what lies ahead may overlap the side.
     points = _inwards(points, across, config.overlap)
-    to_object = _way_to_others(points, outward, limit, others, config)
+    to_object = _way_to_others(points, down_world, length, others, config)
     if to_object < length:
         length, reason = to_object, "ends at the next object"
     # A voxel inside the walls, so that their noise does not count.
-    to_free = _free_before(_inwards(rim, across, voxels.config.size), outward, length, voxels, config)
+    to_free = _free_before(_inwards(rim, across, voxels.config.size), down_world, length, voxels, config)
     if to_free < length:
         length, reason = to_free, "ends at free space"
     if length < LEAST:
         return candidate
     why = f"an unseen side {reason}, {1000 * length:.0f} mm further"
     why = f"{candidate.why}; {why}" if candidate.why else why
-    return replace(candidate, shape=_lengthened(candidate.shape, axis, sign, length), why=why)
-
-
-def _depth_side(candidate: SceneObject) -> tuple[int, float] | None:
-    """The hidden side (axis, sign) opposite the only seen one, if the points do not show the depth."""
-    seen = np.flatnonzero(candidate.seen)
-    if len(seen) != 1:
-        return None
-    axis, side = divmod(int(seen[0]), 2)
-    if isinstance(candidate.shape, Solid) or (isinstance(candidate.shape, Cylinder) and axis != 2):
-        return None
-    # Noise spreads a single side's points over up to 2 cm of depth.
-    return (axis, -1.0 if side else 1.0) if candidate.shape.extents[axis] <= 0.02 else None
+    return replace(candidate, shape=_lengthened(shape, axis, sign, length), why=why)
 
 
 def _way_to_others(
