@@ -16,8 +16,7 @@ from caryatid.manipulation.order import plan_order
 from caryatid.runtime.parallel import cores
 from caryatid.sources import open_run, read_model
 from caryatid.steps import read_config, read_steps
-from caryatid.viz.pdf import print_pdf
-from caryatid.viz.report import make_report, read_lift, render_html
+from caryatid.viz.report import make_report, print_pdf, read_lift, render_html
 from caryatid.viz.tables import census, order_line, order_table
 
 
