@@ -311,7 +311,16 @@ def _figures(step: Step, width: int) -> list[Figure]:
     )
     figures.append(Figure("Fused cloud", draw_cloud(cloud, graph, _first_azimuth(step)), caption))
     if step.candidates is not None or step.decision is not None:
-        figures.append(Figure("Next best view", draw_sphere(step), _sphere_caption(step)))
+        caption = (
+            "The view sphere from above, coloured by saliency; pale views are out of the robot's reach. Rays "
+            "lead from points of interest to the views that show them best. Numbers: views so far."
+        )
+        if step.candidates is not None:
+            counts = step.candidates.rejected.items()
+            refused = ", ".join(f"{count:,} {reason}" for reason, count in counts)
+            caption += f" {len(step.candidates):,} views are reachable"
+            caption += f"; rejected: {refused}." if refused else "."
+        figures.append(Figure("Next best view", draw_sphere(step), caption))
     return figures
 
 
@@ -323,17 +332,6 @@ def sensor_azimuth(cloud: Cloud, T_world_camera: Array | None) -> float:
     elif cloud.viewpoint_world is not None and len(cloud):
         backward = cloud.viewpoint_world - cloud.points_world.mean(axis=0)
     return float(np.arctan2(backward[1], backward[0]))
-
-
-def _sphere_caption(step: Step) -> str:
-    text = (
-        "The view sphere from above, coloured by saliency; pale views are out of the robot's reach. Rays "
-        "lead from points of interest to the views that show them best. Numbers: views so far."
-    )
-    if step.candidates is not None:
-        refused = ", ".join(f"{count:,} {reason}" for reason, count in step.candidates.rejected.items())
-        text += f" {len(step.candidates):,} views are reachable{f'; rejected: {refused}' if refused else ''}."
-    return text
 
 
 # Lifts
