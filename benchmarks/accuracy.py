@@ -297,11 +297,5 @@ class Exact(Spread):
         return 0
 
 
-def main() -> int:
-    """Run the measurement."""
-    commands: dict[str, Any] = {"suite": SuiteRun, "extract": Extract, "exact": Exact}
-    return tyro.extras.subcommand_cli_from_dict(commands).run(Console(width=200))
-
-
 if __name__ == "__main__":
-    run_main(main)
+    run_main({"suite": SuiteRun, "extract": Extract, "exact": Exact})

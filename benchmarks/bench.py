@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -72,6 +71,38 @@ class Bench:
     update: bool = False
     """Write the ratios to the committed baseline; ratios that could not be measured keep their values."""
 
+    def run(self, console: Console) -> int:
+        """Measure, print, write and compare."""
+        if self.docs is not None and (self.only or self.quick):
+            raise InputError("--docs", "the page needs all rows", "omit --only and --quick")
+        if self.quick and (self.update or self.gate):
+            raise InputError("--quick", "its figures cannot be compared", "omit it")
+        numba.config.THREADING_LAYER_PRIORITY = THREADS
+        rows_by_name: dict[str, list[Row]] = {}
+        for name in selected(self.only):
+            busy = psutil.cpu_percent(0.5) / 100.0 * (os.cpu_count() or 1)
+            if busy > CALM:
+                console.print(f"other processes use {busy:.1f} cores: the figures of {name} are unreliable")
+            console.print(f"measuring {name} …", end="")
+            started = time.perf_counter()
+            rows_by_name[name] = MEASUREMENTS[name](replace(QUICK if self.quick else FULL, real=self.real))
+            console.print(f" {time.perf_counter() - started:.0f} s")
+        rows = [row for part in rows_by_name.values() for row in part]
+        show(rows, console)
+        if self.out is not None:
+            told = [
+                asdict(row) | {"to_peer": row.to_peer, "to_limit": row.to_limit, "met": row.met}
+                for row in rows
+            ]
+            about = {"machine": machine(), "provenance": collect_provenance(), "peers": peers.versions()}
+            self.out.write_text(json.dumps(about | {"rows": told}, indent=1) + "\n", encoding="utf-8")
+        if self.docs is not None:
+            write_docs(rows, self.docs)
+        if self.update:  # keep the ratios of rows that were not requested or lack their peer
+            known = {f"{row.name}{figure}" for row in rows for figure in ("", ".to_peer", ".to_limit")}
+            update_baseline(measures(rows), BASELINE, lambda name: bool(self.only) or name in known)
+        return compare(rows_by_name, bool(self.only), console) if self.gate else 0
+
 
 def selected(wanted: Sequence[str]) -> list[str]:
     """Return the measurements whose names equal or begin with the wanted names; all if none are given."""
@@ -125,39 +156,5 @@ def compare(rows_by_name: Mapping[str, Sequence[Row]], part: bool, console: Cons
     return gate(found.values(), BASELINE, console)
 
 
-def main() -> int:
-    """Measure, print, write and compare."""
-    args = tyro.cli(Bench)
-    if args.docs is not None and (args.only or args.quick):
-        raise InputError("--docs", "the page needs all rows", "omit --only and --quick")
-    if args.quick and (args.update or args.gate):
-        raise InputError("--quick", "its figures cannot be compared", "omit it")
-    numba.config.THREADING_LAYER_PRIORITY = THREADS
-    console = Console(width=None if sys.stdout.isatty() else 240)
-    rows_by_name: dict[str, list[Row]] = {}
-    for name in selected(args.only):
-        busy = psutil.cpu_percent(0.5) / 100.0 * (os.cpu_count() or 1)
-        if busy > CALM:
-            console.print(f"other processes use {busy:.1f} cores: the figures of {name} are unreliable")
-        console.print(f"measuring {name} …", end="")
-        started = time.perf_counter()
-        rows_by_name[name] = MEASUREMENTS[name](replace(QUICK if args.quick else FULL, real=args.real))
-        console.print(f" {time.perf_counter() - started:.0f} s")
-    rows = [row for part in rows_by_name.values() for row in part]
-    show(rows, console)
-    if args.out is not None:
-        told = [
-            asdict(row) | {"to_peer": row.to_peer, "to_limit": row.to_limit, "met": row.met} for row in rows
-        ]
-        about = {"machine": machine(), "provenance": collect_provenance(), "peers": peers.versions()}
-        args.out.write_text(json.dumps(about | {"rows": told}, indent=1) + "\n", encoding="utf-8")
-    if args.docs is not None:
-        write_docs(rows, args.docs)
-    if args.update:  # keep the ratios of rows that were not requested or lack their peer
-        known = {f"{row.name}{figure}" for row in rows for figure in ("", ".to_peer", ".to_limit")}
-        update_baseline(measures(rows), BASELINE, lambda name: bool(args.only) or name in known)
-    return compare(rows_by_name, bool(args.only), console) if args.gate else 0
-
-
 if __name__ == "__main__":
-    run_main(main)
+    run_main(Bench)

@@ -10,13 +10,12 @@ changed scene. A run without a change has ten views.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
 import tyro
-from measures import OnScenes, print_table, run_main
-from rich.console import Console
+from measures import OnScenes, Row, run_main
 
 from caryatid.benchmark.episodes import open_scene
 from caryatid.config.settings import read_settings
@@ -35,45 +34,54 @@ KINDS = ("removed", "moved", "added", "nothing")
 
 
 @dataclass(frozen=True)
-class Args(OnScenes):
+class Changes(OnScenes):
     """Change scenes between two views, and count the changes that are noticed."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = PILES
     """Names of built-in scenes, or scene folders."""
     kinds: tuple[str, ...] = KINDS
     """Kinds of change: any of `removed`, `moved`, `added` and `nothing`."""
+    groups = "kind"
 
+    def measure(self, name: str) -> list[Row]:
+        """Run one scene with each kind of change that one of its objects allows."""
+        return [row for kind in self.kinds if (row := self.changed(name, kind)) is not None]
 
-def measure(task: tuple[str, str, Args]) -> dict[str, Any] | None:
-    """Run one scene with one kind of change; None if no object can be changed in this way."""
-    name, kind, args = task
-    scene, _ = open_scene(name)
-    rng = np.random.default_rng([args.seed, KINDS.index(kind), args.scenes.index(name)])
-    begin = end = poses_of(scene)
-    if kind != "nothing":
-        changed = change(scene, kind, rng)
-        if changed is None:
+    def changed(self, name: str, kind: str) -> Row | None:
+        """Run one scene with one kind of change; None if no object can be changed in this way."""
+        scene, _ = open_scene(name)
+        rng = np.random.default_rng([self.seed, KINDS.index(kind), self.scenes.index(name)])
+        states = (poses_of(scene),) * 2 if kind == "nothing" else change(scene, kind, rng)
+        if states is None:
             return None
-        begin, end = changed
-    config = read_settings(None, (f"active.max_views={UNCHANGED}", *args.set))
-    camera, explorer = args.start(scene, config)
-    camera.scene = posed(scene, begin)
-    told: list[str] = []
-    for number in range(UNCHANGED if kind == "nothing" else BEFORE + AFTER):
-        if number == BEFORE:
-            camera.scene = posed(scene, end)
-        if number > 0:
-            explorer.plan()
-            explorer.go()
-        step = explorer.look()
-        told += [f"{c.kind} {c.object_id} in view {number + 1}: {c.why}" for c in step.changes]
-        if number < BEFORE or kind == "nothing":
-            false = len(told)
-    found = score(step.graph, truth_of(camera.scene))
-    noticed = kind == "nothing" or any(t.startswith(kind) for t in told[false:])
-    other = sum(not t.startswith(kind) for t in told[false:])
-    row = {"scene": name, "kind": kind, "noticed": float(noticed), "f1": found.f1, "false": false}
-    return row | {"other": other, "told": told}
+        config = read_settings(None, (f"active.max_views={UNCHANGED}", *self.set))
+        camera, explorer = self.start(scene, config)
+        camera.scene = posed(scene, states[0])
+        told: list[str] = []
+        for number in range(UNCHANGED if kind == "nothing" else BEFORE + AFTER):
+            if number == BEFORE:
+                camera.scene = posed(scene, states[1])
+            if number > 0:
+                explorer.plan()
+                explorer.go()
+            step = explorer.look()
+            told += [f"{c.kind} {c.object_id} in view {number + 1}: {c.why}" for c in step.changes]
+            if number < BEFORE or kind == "nothing":
+                false = len(told)
+        right = [t.startswith(kind) for t in told[false:]]
+        row = {"scene": name, "kind": kind, "noticed": float(kind == "nothing" or any(right))}
+        row |= {"f1": score(step.graph, truth_of(camera.scene)).f1, "false": false}
+        return row | {"other": right.count(False), "told": told}
+
+    def summary(self, rows: pd.DataFrame) -> dict[str, float]:
+        """Return means of what was noticed and of F1, and sums of changes that did not happen."""
+        return {"runs": len(rows), **rows[["noticed", "f1"]].mean(), **rows[["false", "other"]].sum()}
+
+    def remark(self, row: Row) -> str:
+        """Say what the model reported in a run that went wrong."""
+        if row["noticed"] and row["f1"] >= 0.9 and not row["false"] and not row["other"]:
+            return ""
+        return f"{row['scene']} {row['kind']}: F1 {row['f1']:.3f}; {row['told']}"
 
 
 def change(scene: SimulatedScene, kind: str, rng: np.random.Generator) -> tuple[Array, Array] | None:
@@ -122,24 +130,5 @@ def truth_of(scene: SimulatedScene) -> TrueScene:
     return true_scene_from_simulation(scene, GroundTruth(vertices, edges))
 
 
-def main() -> int:
-    """Run the measurement."""
-    args = tyro.cli(Args)
-    tasks = [(scene, kind, args) for scene in args.scenes for kind in args.kinds]
-    rows = [row for row in args.each(measure, tasks) if row is not None]
-    frame = pd.DataFrame(rows)
-    means = frame.groupby("kind").agg(
-        runs=("f1", "size"), noticed=("noticed", "mean"), f1=("f1", "mean"),
-        false=("false", "sum"), other=("other", "sum"),
-    )  # fmt: skip
-    console = Console(width=160)
-    print_table(means.round(3).reset_index(), console)
-    for row in rows:
-        if not row["noticed"] or row["f1"] < 0.9 or row["false"] or row["other"]:
-            console.print(f"{row['scene']} {row['kind']}: F1 {row['f1']:.3f}; {row['told']}")
-    args.write(rows)
-    return 0
-
-
 if __name__ == "__main__":
-    run_main(main)
+    run_main(Changes)

@@ -26,14 +26,13 @@ import sys
 from collections import deque
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import mujoco
 import numpy as np
 import pandas as pd
 import tyro
-from measures import OnScenes, run_main
-from rich.console import Console
+from measures import OnScenes, Row, run_main
 
 from caryatid.benchmark.episodes import open_scene
 from caryatid.benchmark.suites import DENSE, HEAPED
@@ -50,7 +49,7 @@ from caryatid.simulation.world import SimulatedScene, poses_of, quaternion
 
 
 @dataclass(frozen=True)
-class Args(OnScenes):
+class Clear(OnScenes):
     """Clear scenes in a physics simulation."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = (*HEAPED, *DENSE)
@@ -62,54 +61,74 @@ class Args(OnScenes):
     order: int = 0
     """Number of views after which a whole order is planned and carried out; 0 looks again after each lift."""
 
+    def measure(self, name: str) -> list[Row]:
+        """Clear one scene, or reach each goal in it; return one row per run."""
+        scene, _ = open_scene(name)
+        labels = self.drawn(name, list(scene.object_bodies), self.goals) if self.goals else [None]
+        rows = [self.cleared(name, scene, label) for label in labels]
+        print(*rows, sep="\n", file=sys.stderr, flush=True)
+        return rows
 
-def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
-    """Clear one scene, or reach each goal in it; return one row per run."""
-    name, args = task
-    scene, _ = open_scene(name)
-    chosen = args.drawn(name, list(scene.object_bodies), args.goals) if args.goals else [None]
-    rows = [cleared(name, scene, args, label) for label in chosen]
-    print(*rows, sep="\n", file=sys.stderr, flush=True)
-    return rows
+    def cleared(self, name: str, scene: SimulatedScene, goal: int | None) -> Row:
+        """Clear a scene, or reach the body with the goal's label."""
+        config, wanted = read_settings(None, self.set), None if goal is None else f"o{goal}"
+        camera, explorer = self.start(scene, config)
+        hands, done = SimulatedHands(scene, config), list[Taken]()
+        grasps = list[tuple[list[str], bool]]()
 
+        def take(step: TakeStep) -> bool:
+            before, bodies = hands.state, hands.bodies(explorer.scene.graph)
+            body = bodies.get(step.object_id)
+            if step.grasp is not None and body in hands.left:
+                grasps.append(grasped(scene, before, step.grasp, body, config.gripper))
+            done.append(hands.take(step, bodies))
+            camera.scene = hands.scene
+            return done[-1].body is not None
 
-def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> dict[str, Any]:
-    """Clear a scene, or reach the body with the goal's label."""
-    config = read_settings(None, args.set)
-    camera, explorer = args.start(scene, config)
-    hands, done = SimulatedHands(scene, config), list[Taken]()
-    grasps = list[tuple[list[str], bool]]()
+        if self.order:
+            steps = [explorer.look()]
+            while len(steps) < self.order and explorer.plan().decision is not None:
+                explorer.go()
+                steps.append(explorer.look())
+            order = plan_order(explorer.scene.graph, config, goal=wanted, hands=self.hands, seed=self.seed)
+            for step in takewhile(lambda step: step.safe, order.steps):
+                take(step)
+        else:
+            steps = list(clear(explorer, take, goal=wanted, hands=self.hands))
+        lifted = [t for t in done if t.body is not None]
+        harm = [f"{t.step.object_id}: {', '.join(t.disturbed)}" for t in lifted if not t.ok]
+        row = {"scene": name, "objects": len(scene.object_bodies), "lifts": len(lifted), "views": len(steps)}
+        row |= {"missed": len(done) - len(lifted), "harmed": len(harm), "harm": harm}
+        row |= {"stop": steps[-1].stop, "grasps": len(grasps), "clear": sum(not t for t, _ in grasps)}
+        row |= {"held": sum(held for _, held in grasps), "touched": [t for t, _ in grasps if t]}
+        if goal is None:
+            return row | {"cleared": float(not hands.left)}
+        body = scene.object_bodies[goal]
+        row |= {"goal": wanted, "cleared": float(any(t.body == body for t in lifted))}
+        return row | {"fewest": fewest(scene, body, config)}
 
-    def take(step: TakeStep) -> bool:
-        before, body = hands.state, hands.bodies(explorer.scene.graph).get(step.object_id)
-        if step.grasp is not None and body in hands.left:
-            grasps.append(grasped(scene, before, step.grasp, body, config.gripper))
-        done.append(hands.take(step, hands.bodies(explorer.scene.graph)))
-        camera.scene = hands.scene
-        return done[-1].body is not None
+    def summary(self, rows: pd.DataFrame) -> dict[str, float]:
+        """Return shares of scenes, and figures per lift."""
+        unharmed = rows["harmed"] == 0
+        found = {"runs": len(rows), "unharmed": unharmed.mean(), "cleared": rows["cleared"].mean()}
+        found |= {"both": (unharmed & (rows["cleared"] == 1.0)).mean()}
+        found |= {"lifts unharmed": 1.0 - rows["harmed"].sum() / rows["lifts"].sum()}
+        found |= {"harmful lifts": rows["harmed"].sum()}
+        found |= {"views per lift": rows["views"].sum() / rows["lifts"].sum(), "missed": rows["missed"].sum()}
+        if rows["grasps"].sum():
+            found |= {f"grasps {name}": rows[name].sum() / rows["grasps"].sum() for name in ("clear", "held")}
+        if "fewest" in rows:
+            known = rows[(rows["cleared"] == 1.0) & (rows["fewest"] > 0)]
+            found |= {"a way exists": (rows["fewest"] > 0).mean()}
+            found |= {"lifts": known["lifts"].sum(), "fewest": known["fewest"].sum()}
+            found |= {"of the fewest": known["lifts"].sum() / max(known["fewest"].sum(), 1)}
+        return found
 
-    wanted = None if goal is None else f"o{goal}"
-    if args.order:
-        steps = [explorer.look()]
-        while len(steps) < args.order and explorer.plan().decision is not None:
-            explorer.go()
-            steps.append(explorer.look())
-        order = plan_order(explorer.scene.graph, config, goal=wanted, hands=args.hands, seed=args.seed)
-        for step in takewhile(lambda step: step.safe, order.steps):
-            take(step)
-    else:
-        steps = list(clear(explorer, take, goal=wanted, hands=args.hands))
-    lifted = [t for t in done if t.body is not None]
-    harm = [f"{t.step.object_id}: {', '.join(t.disturbed)}" for t in lifted if not t.ok]
-    row = {"scene": name, "objects": len(scene.object_bodies), "lifts": len(lifted), "views": len(steps)}
-    row |= {"missed": len(done) - len(lifted), "harmed": len(harm), "harm": harm}
-    row |= {"stop": steps[-1].stop, "grasps": len(grasps), "clear": sum(not t for t, _ in grasps)}
-    row |= {"held": sum(held for _, held in grasps), "touched": [t for t, _ in grasps if t]}
-    if goal is None:
-        return row | {"cleared": float(not hands.left)}
-    body = scene.object_bodies[goal]
-    row |= {"goal": f"o{goal}", "cleared": float(any(t.body == body for t in lifted))}
-    return row | {"fewest": fewest(scene, body, config)}
+    def remark(self, row: Row) -> str:
+        """Say what went wrong in a run."""
+        if row["cleared"] and not row["harmed"]:
+            return ""
+        return f"{row['scene']}: {row['harm']}; {row['stop']}"
 
 
 def grasped(
@@ -196,32 +215,5 @@ def fewest(scene: SimulatedScene, goal: str, config: Config) -> int:
     return 0
 
 
-def summary(rows: pd.DataFrame) -> dict[str, float]:
-    """Return shares of scenes, and figures per lift."""
-    unharmed = rows["harmed"] == 0
-    found = {"runs": len(rows), "unharmed": unharmed.mean(), "cleared": rows["cleared"].mean()}
-    found |= {"both": (unharmed & (rows["cleared"] == 1.0)).mean()}
-    found |= {"lifts unharmed": 1.0 - rows["harmed"].sum() / rows["lifts"].sum()}
-    found |= {"harmful lifts": rows["harmed"].sum()}
-    found |= {"views per lift": rows["views"].sum() / rows["lifts"].sum(), "missed": rows["missed"].sum()}
-    if rows["grasps"].sum():
-        found |= {f"grasps {name}": rows[name].sum() / rows["grasps"].sum() for name in ("clear", "held")}
-    if "fewest" in rows:
-        known = rows[(rows["cleared"] == 1.0) & (rows["fewest"] > 0)]
-        found |= {"a way exists": (rows["fewest"] > 0).mean()}
-        found |= {"lifts": known["lifts"].sum(), "fewest": known["fewest"].sum()}
-        found |= {"of the fewest": known["lifts"].sum() / max(known["fewest"].sum(), 1)}
-    return found
-
-
-def main() -> int:
-    """Run the measurement."""
-    args, console = tyro.cli(Args), Console(width=160)
-    for row in args.show(measure, summary, console):
-        if row["harmed"] or not row["cleared"]:
-            console.print(f"{row['scene']}: {row['harm']}; {row['stop']}")
-    return 0
-
-
 if __name__ == "__main__":
-    run_main(main)
+    run_main(Clear)

@@ -18,12 +18,13 @@ can tell is measured:
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
-from measures import Gated, Measure, run_main
+import pandas as pd
+from measures import Gated, Measure, Row, run_main
 from peers import NEIGHBOURS
 from rich.console import Console
 from scipy.spatial import cKDTree
@@ -44,20 +45,6 @@ STEEPEST = np.radians(80.0)
 """Maximum angle between a surface's normal and the viewing direction for readings [rad]."""
 ONE_VIEW = FitConfig(correlated=1.0, registration=0.0, rim=0.0)
 """Point errors are independent here: no registration error, no smoothing, no loss of pixels at rims."""
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One fit: the kind of the true shape, the kind found (`none` if none was), and a readable note.
-
-    `errors` are (quantity, error, claimed standard deviation) [mm, deg] of everything the view can tell; none
-    if the shape is wrong.
-    """
-
-    kind: str
-    found: str
-    errors: tuple[tuple[str, float, float], ...]
-    note: str
 
 
 def random_shape(kind: str, rng: np.random.Generator) -> Shape:
@@ -115,8 +102,13 @@ def dense_surface(shape: Shape, count: int, rng: np.random.Generator) -> tuple[A
     return transforms.transform(shape.T_world_object, local), transforms.rotate(shape.T_world_object, outward)
 
 
-def run_trial(task: tuple[str, int, float, int]) -> Trial:
-    """Draw a shape and a view of it, fit, and compare."""
+def run_trial(task: tuple[str, int, float, int]) -> Row:
+    """Draw a shape and a view of it, fit, and compare.
+
+    Returns:
+        `kind` of the true shape, `found` (kind of the fit, or `none`), `note`, and `errors`: quantity, error
+        and claimed standard deviation [mm, deg] of everything the view can tell; none if the shape is wrong.
+    """
     kind, seed, sigma, count = task
     rng = np.random.default_rng([KINDS.index(kind), seed])
     shape = random_shape(kind, rng)
@@ -124,11 +116,11 @@ def run_trial(task: tuple[str, int, float, int]) -> Trial:
     result = fit(points, normals, config=ONE_VIEW, rng=np.random.default_rng(seed))
     note = f"{kind} {seed}: {np.round(1e3 * shape.extents, 1)}"
     if not isinstance(result, Fit):
-        return Trial(kind, "none", (), note)
-    note += f" → {result.shape.kind} {np.round(1e3 * result.shape.extents, 1)}"
-    if result.shape.kind != kind:
-        return Trial(kind, result.shape.kind, (), note)
-    return Trial(kind, kind, tuple(errors_of(result, shape, view)), note)
+        return {"kind": kind, "found": "none", "errors": [], "note": note}
+    found = result.shape.kind
+    note += f" → {found} {np.round(1e3 * result.shape.extents, 1)}"
+    errors = errors_of(result, shape, view) if found == kind else []
+    return {"kind": kind, "found": found, "errors": errors, "note": note}
 
 
 def errors_of(result: Fit, shape: Shape, view: Array) -> list[tuple[str, float, float]]:
@@ -150,50 +142,41 @@ def errors_of(result: Fit, shape: Shape, view: Array) -> list[tuple[str, float, 
     return [("extent", longer[k], sigma[k]) for k in range(3) if np.delete(facing, k).any()]
 
 
-def measures(prefix: str, trials: list[Trial]) -> list[Measure]:
+def measures(prefix: str, trials: Sequence[Row]) -> list[Measure]:
     """Return the share of right shapes, and median, 95th percentile and bias of each quantity's error."""
     found = []
-    for kind in KINDS:
-        part = [t for t in trials if t.kind == kind]
-        right = float(np.mean([t.found == kind for t in part]))
+    for kind, part in pd.DataFrame(trials).groupby("kind", sort=False):
+        right = float((part["found"] == kind).mean())
         found.append(Measure(f"{prefix}{kind}.right", right, "1", "higher", 0.01))
-        for name in dict.fromkeys(e[0] for t in part for e in t.errors):
-            values, sigmas = np.array([e[1:] for t in part for e in t.errors if e[0] == name]).T
-            within = float(np.mean(np.abs(values) < 2.0 * sigmas))
-            found.append(Measure(f"{prefix}{kind}.{name}.within", within, "1", "higher", 0.05))
-            unit = "deg" if name == "axis" else "mm"
-            for label, figure in (
-                ("median", np.median(np.abs(values))),
-                ("95", np.quantile(np.abs(values), 0.95)),
-                ("bias", abs(np.mean(values)) if name != "axis" else 0.0),
-            ):
-                full = f"{prefix}{kind}.{name}.{label}"
-                found.append(Measure(full, float(figure), unit, "lower", 0.1 + 0.1 * float(figure)))
+        errors = pd.DataFrame(part["errors"].sum(), columns=["quantity", "error", "sigma"])
+        for quantity, each in errors.groupby("quantity", sort=False):
+            name, size = f"{prefix}{kind}.{quantity}", each["error"].abs()
+            within = float((size < 2.0 * each["sigma"]).mean())
+            found.append(Measure(f"{name}.within", within, "1", "higher", 0.05))
+            unit, bias = ("deg", 0.0) if quantity == "axis" else ("mm", abs(each["error"].mean()))
+            for label, figure in ("median", size.median()), ("95", size.quantile(0.95)), ("bias", bias):
+                found.append(Measure(f"{name}.{label}", float(figure), unit, "lower", 0.1 + 0.1 * figure))
     return found
 
 
 @dataclass(frozen=True)
-class Args(Gated):
+class Fits(Gated):
     """Fit shapes to synthetic half views."""
 
     trials: int = 200
     """Number of trials per kind of shape."""
 
-
-def main() -> int:
-    """Run the measurement."""
-    args = tyro.cli(Args)
-    console = Console(width=120)
-    found: list[Measure] = []
-    rows = []
-    for prefix, sigma, count in SETTINGS:
-        tasks = [(kind, seed, sigma, count) for kind in KINDS for seed in range(args.trials)]
-        trials = args.each(run_trial, tasks, chunk=10)
-        rows += [{"setting": prefix} | asdict(trial) for trial in trials]
-        found += measures(prefix, trials)
-    args.write(rows)
-    return args.finish(found, BASELINE, console)
+    def run(self, console: Console) -> int:
+        """Fit, print and compare."""
+        found, rows = list[Measure](), list[Row]()
+        for prefix, sigma, count in SETTINGS:
+            tasks = [(kind, seed, sigma, count) for kind in KINDS for seed in range(self.trials)]
+            trials = self.each(run_trial, tasks, chunk=10)
+            rows += [{"setting": prefix} | trial for trial in trials]
+            found += measures(prefix, trials)
+        self.write(rows)
+        return self.finish(found, BASELINE, console)
 
 
 if __name__ == "__main__":
-    run_main(main)
+    run_main(Fits)

@@ -17,8 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 import pandas as pd
 import tyro
-from measures import OnScenes, run_main
-from rich.console import Console
+from measures import OnScenes, Row, run_main
 
 from caryatid.benchmark.episodes import open_scene
 from caryatid.benchmark.suites import DENSE
@@ -38,7 +37,7 @@ PILES = tuple(f"pile-{6 + k}-{901 + k}" for k in range(16))
 
 
 @dataclass(frozen=True)
-class Args(OnScenes):
+class Goals(OnScenes):
     """Explore with and without a goal."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = (*DENSE, *PILES)
@@ -50,36 +49,48 @@ class Args(OnScenes):
     planner: str = "support"
     """Planner that chooses the views."""
 
+    def measure(self, name: str) -> list[Row]:
+        """Explore one scene without a goal and with each goal; return one row per goal."""
+        config, (scene, truth) = read_settings(None, self.set), open_scene(name)
+        bodies = scene.object_bodies
+        names = list(bodies.values())
 
-def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
-    """Explore one scene without a goal and with each goal; return one row per goal."""
-    name, args = task
-    config, (scene, truth) = read_settings(None, args.set), open_scene(name)
-    bodies = scene.object_bodies
-    names = list(bodies.values())
+        def explored(goal: str | None) -> tuple[int, SupportGraph]:
+            simulation = make_simulation(scene, config, noise=self.noise, seed=self.seed)
+            known: dict[str, Any] = {"config": config, "seed": self.seed, "segmentation": self.segmentation}
+            known |= {"planner": self.planner, "goal": goal, "until": self.until if goal else None}
+            *_, last = explore(simulation.camera, simulation.robot, **known)
+            return last.index + 1, last.graph
 
-    def explored(goal: str | None) -> tuple[int, SupportGraph]:
-        simulation = make_simulation(scene, config, noise=args.noise, seed=args.seed)
-        known: dict[str, Any] = {"config": config, "seed": args.seed, "segmentation": args.segmentation}
-        known |= {"planner": args.planner, "goal": goal, "until": args.until if goal else None}
-        *_, last = explore(simulation.camera, simulation.robot, **known)
-        return last.index + 1, last.graph
+        views, graph = explored(None)
+        lifting, rows = Lifting(scene.spec, names), []
+        for label in self.drawn(name, list(bodies), self.goals):
+            taken = {bodies[k] for k in displaced_without(scene, label, PhysicsConfig())}
+            lift = lifting.lift(poses_of(scene), names.index(bodies[label]), config.lift)
+            lifted = {names[k] for k in np.flatnonzero(lift.disturbed)}
+            fewer, with_goal = explored(f"o{label}")
+            row = {"scene": name, "goal": f"o{label}", "others": len(names) - 1}
+            row |= {"views": fewer, "all views": views}
+            for which, found in (("", with_goal), ("all ", graph)):
+                moves = predicted(found, f"o{label}", truth, config)
+                for how, true in (("taken", taken), ("lifted", lifted)):
+                    right = len(names) - 1 - len(moves ^ true)
+                    row |= {f"{how} moving": len(true), f"{which}{how} right": right}
+            rows.append(row)
+        return rows
 
-    views, graph = explored(None)
-    lifting, rows = Lifting(scene.spec, names), []
-    for label in args.drawn(name, list(bodies), args.goals):
-        taken = {bodies[k] for k in displaced_without(scene, label, PhysicsConfig())}
-        lift = lifting.lift(poses_of(scene), names.index(bodies[label]), config.lift)
-        lifted = {names[k] for k in np.flatnonzero(lift.disturbed)}
-        fewer, with_goal = explored(f"o{label}")
-        row = {"scene": name, "goal": f"o{label}", "others": len(names) - 1}
-        row |= {"views": fewer, "all views": views}
-        for which, found in (("", with_goal), ("all ", graph)):
-            moves = predicted(found, f"o{label}", truth, config)
-            for how, true in (("taken", taken), ("lifted", lifted)):
-                row |= {f"{how} moving": len(true), f"{which}{how} right": len(names) - 1 - len(moves ^ true)}
-        rows.append(row)
-    return rows
+    def summary(self, rows: pd.DataFrame) -> dict[str, float]:
+        """Return views with and without a goal, and the shares of right objects and of wholly right goals."""
+        sums = rows.sum(numeric_only=True)
+        found = {"goals": len(rows), "views": rows["views"].mean(), "all views": rows["all views"].mean()}
+        found |= {"share of views": sums["views"] / sums["all views"]}
+        for how in ("taken", "lifted"):
+            found[f"{how}: moving"] = sums[f"{how} moving"] / sums["others"]
+            for which in ("", "all "):
+                right = f"{which}{how} right"
+                found[f"{how}: {which}right"] = sums[right] / sums["others"]
+                found[f"{how}: {which}wholly"] = (rows[right] == rows["others"]).mean()
+        return found
 
 
 def predicted(graph: SupportGraph, goal: str, truth: TrueScene, config: Any) -> Set[str]:
@@ -91,25 +102,5 @@ def predicted(graph: SupportGraph, goal: str, truth: TrueScene, config: Any) -> 
     return {bodies.get(e.object_id, e.object_id) for e in effects if e.probability >= 0.5}
 
 
-def summary(rows: pd.DataFrame) -> dict[str, float]:
-    """Return views with and without a goal, and the shares of right objects and of wholly right goals."""
-    sums = rows.sum(numeric_only=True)
-    found = {"goals": len(rows), "views": rows["views"].mean(), "all views": rows["all views"].mean()}
-    found |= {"share of views": sums["views"] / sums["all views"]}
-    for how in ("taken", "lifted"):
-        found[f"{how}: moving"] = sums[f"{how} moving"] / sums["others"]
-        for which in ("", "all "):
-            right = f"{which}{how} right"
-            found[f"{how}: {which}right"] = sums[right] / sums["others"]
-            found[f"{how}: {which}wholly"] = (rows[right] == rows["others"]).mean()
-    return found
-
-
-def main() -> int:
-    """Run the measurement."""
-    tyro.cli(Args).show(measure, summary, Console(width=160))
-    return 0
-
-
 if __name__ == "__main__":
-    run_main(main)
+    run_main(Goals)

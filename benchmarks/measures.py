@@ -7,10 +7,10 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -26,6 +26,7 @@ from caryatid.simulation.world import SimulatedScene
 
 T = TypeVar("T")
 R = TypeVar("R")
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -80,12 +81,26 @@ class Simulated(Spread):
 
 @dataclass(frozen=True)
 class OnScenes(Simulated):
-    """Options of a benchmark that explores simulated scenes."""
+    """A benchmark that explores simulated scenes; subclasses say what is measured and how it is summed up."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Names of built-in scenes, or scene folders."""
     segmentation: SegmentationMethod = "labels"
     """Where segments come from."""
+    groups: ClassVar[str] = "family"
+    """Column whose values each get a summary."""
+
+    def measure(self, name: str) -> list[Row]:
+        """Measure one scene."""
+        raise NotImplementedError
+
+    def summary(self, rows: pd.DataFrame) -> dict[str, float]:
+        """Sum up rows."""
+        raise NotImplementedError
+
+    def remark(self, row: Row) -> str:
+        """What to print of a row; by default nothing."""
+        return ""
 
     def start(self, scene: SimulatedScene, config: Config, **known: Any) -> tuple[Any, Explorer]:
         """Return the simulated camera in a scene, and an exploration with it."""
@@ -99,20 +114,18 @@ class OnScenes(Simulated):
         chosen: list[int] = rng.choice(labels, min(goals, len(labels)), replace=False).tolist()
         return chosen
 
-    def show(
-        self,
-        measure: Callable[[tuple[str, Any]], list[dict[str, Any]]],
-        summary: Callable[[pd.DataFrame], dict[str, float]],
-        console: Console,
-    ) -> list[dict[str, Any]]:
-        """Measure every scene, print a summary of each family, and return all rows."""
-        rows = [row for part in self.each(measure, [(name, self) for name in self.scenes]) for row in part]
+    def run(self, console: Console) -> int:
+        """Measure every scene, and print a summary of each group of rows, and remarks."""
+        rows = [row for part in self.each(self.measure, self.scenes) for row in part]
         frame = pd.DataFrame(rows)
-        groups = {str(name): group for name, group in frame.groupby(frame["scene"].map(family))}
-        shown = pd.DataFrame({name: summary(group) for name, group in (groups | {"all": frame}).items()})
+        frame["family"] = frame["scene"].map(family)
+        groups = {str(name): self.summary(group) for name, group in frame.groupby(self.groups, sort=False)}
+        shown = pd.DataFrame(groups | {"all": self.summary(frame)})
         print_table(shown.round(3).rename_axis("scenes").reset_index(), console)
+        for remark in filter(None, map(self.remark, rows)):
+            console.print(remark)
         self.write(rows)
-        return rows
+        return 0
 
 
 @dataclass(frozen=True)
@@ -135,9 +148,8 @@ class Gated(Spread):
 
         Baseline entries that were not measured stay if `kept` returns True for their names.
         """
-        rows = [(m.name, f"{m.value:.3f}", m.unit, m.better, f"{m.tolerance:.3g}") for m in found]
-        columns = ["measure", "value", "unit", "better", "± tolerated"]
-        print_table(pd.DataFrame(rows, columns=columns), console)
+        table = pd.DataFrame(map(asdict, found)).rename(columns={"tolerance": "± tolerated"})
+        print_table(table.round(3), console)
         if self.update:
             update_baseline(found, baseline, kept)
         return gate(found, baseline, console) if self.gate else 0
@@ -172,12 +184,15 @@ def gate(measures: Iterable[Measure], path: Path, console: Console) -> int:
 
 def print_table(table: pd.DataFrame, console: Console) -> None:
     """Print a whole table."""
-    console.print(table.to_string(index=False), markup=False, highlight=False, soft_wrap=True)
+    console.print(table.to_string(index=False))
 
 
-def run_main(main: Callable[[], int]) -> None:
-    """Run a benchmark's main function, and exit with its status or its error."""
+def run_main(command: Any) -> None:
+    """Parse the options of a benchmark, or of one of several by name, and exit with its status or error."""
     try:
-        sys.exit(main())
+        args = (
+            tyro.extras.subcommand_cli_from_dict(command) if isinstance(command, dict) else tyro.cli(command)
+        )
+        sys.exit(args.run(Console(soft_wrap=True, highlight=False, markup=False, emoji=False)))
     except CaryatidError as error:
         sys.exit(f"error: {error}")

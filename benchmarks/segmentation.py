@@ -14,13 +14,13 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
 import tyro
 from accuracy import EASY
-from measures import Gated, Measure, Simulated, print_table, run_main
+from measures import Gated, Measure, Row, Simulated, print_table, run_main
 from numpy.typing import NDArray
 from rich.console import Console
 
@@ -44,13 +44,12 @@ LEAST_PIXELS = 200
 """Minimum readings of a true object that counts [px]: 2 cm at 1 m. Segments of smaller ones are ignored."""
 MIN_IOU = 0.5
 """Minimum IoU of masks at which a segment is an object [1], as in docs/method.md, section V."""
-COUNTED = ("found", "invented", "split", "merged")
 SHARE = 0.2
 """A segment that holds this share of an object's readings is a piece of it [1]."""
 
 
 @dataclass(frozen=True)
-class Args(Gated, Simulated):
+class Segmentation(Gated, Simulated):
     """Segment views, and compare the segments with true masks."""
 
     sources: Annotated[tuple[str, ...], tyro.conf.Positional] = BUILT_IN
@@ -58,21 +57,52 @@ class Args(Gated, Simulated):
     views: int = 4
     """Number of views of each scene; a recording has its own."""
 
+    def views_of(self, source: str, config: Config) -> Iterator[View]:
+        """Yield the views of a source, with true labels."""
+        if kind_of(source) == "recording":
+            yield from read_recording(source)
+            return
+        opened = open_source(source, config, noise=self.noise, segmentation="labels", seed=self.seed)
+        if opened.truth is None:
+            raise CaryatidError(f"{source}: has no ground truth to score against")
+        sphere = ViewSphere.around(np.array([0.0, 0.0, opened.truth.table_top]), config.active)
+        found = opened.robot.candidates(sphere)
+        first = opened.robot.T_world_camera
+        others = spread_out(found.directions, sphere.direction_of(first)[None], self.views - 1)
+        for T_world_camera in (first, *found.T_world_camera[others]):
+            yield opened.camera.capture(T_world_camera)
 
-def views_of(source: str, args: Args, config: Config) -> Iterator[View]:
-    """Yield the views of a source, with true labels."""
-    if kind_of(source) == "recording":
-        yield from read_recording(source)
-        return
-    opened = open_source(source, config, noise=args.noise, segmentation="labels", seed=args.seed)
-    if opened.truth is None:
-        raise CaryatidError(f"{source}: has no ground truth to score against")
-    sphere = ViewSphere.around(np.array([0.0, 0.0, opened.truth.table_top]), config.active)
-    found = opened.robot.candidates(sphere)
-    first = opened.robot.T_world_camera
-    others = spread_out(found.directions, sphere.direction_of(first)[None], args.views - 1)
-    for T_world_camera in (first, *found.T_world_camera[others]):
-        yield opened.camera.capture(T_world_camera)
+    def measure(self, source: str) -> list[Row]:
+        """Segment the views of one source; return one row per view."""
+        config, rows = read_settings(None, self.set), []
+        for number, view in enumerate(self.views_of(source, config)):
+            rng = np.random.default_rng(self.seed)
+            seen = observe(view, config, segmentation="auto", known=None, rng=rng)
+            if seen.view is None or view.labels is None:
+                raise CaryatidError(f"{view.name}: has no masks to compare with")
+            started = time.perf_counter()
+            labels = segment(seen.view, seen.surface, config.segmentation, config.cloud, config.fit, rng)[0]
+            known = {"source": Path(source).name, "view": number, "seconds": time.perf_counter() - started}
+            rows.append(known | compare(labels[view.valid], view.labels[view.valid]))
+        return rows
+
+    def run(self, console: Console) -> int:
+        """Segment all views, print sums by family and the worst views, and compare."""
+        rows = pd.DataFrame([row for part in self.each(self.measure, self.sources) for row in part])
+        sums = rows.groupby(rows["source"].map(family).rename("sources")).sum(numeric_only=True)
+        print_table(sums.drop(columns="view").reset_index().round(2), console)
+        worst = rows.loc[(rows["found"] - rows["true"] - rows["invented"]).nsmallest(8).index].itertuples()
+        console.print(
+            "worst: " + ", ".join(f"{r.source} view {r.view}: {r.found} of {r.true}" for r in worst)
+        )
+        self.write(rows.to_dict("records"))
+        shares = sums[["found", "split", "merged"]].div(sums["true"].clip(lower=1), axis=0)
+        shares["invented"] = sums["invented"] / sums["parts"].clip(lower=1)
+        found = [
+            Measure(f"{name}.{field}", value, "1", "higher" if field == "found" else "lower", 0.02)
+            for (name, field), value in shares.stack().items()
+        ]
+        return self.finish(found, BASELINE, console)
 
 
 def compare(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> dict[str, int]:
@@ -103,51 +133,5 @@ def compare(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> dict[str, in
     }
 
 
-def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
-    """Segment the views of one source; return one row per view."""
-    source, args = task
-    config = read_settings(None, args.set)
-    rows = []
-    for number, view in enumerate(views_of(source, args, config)):
-        rng = np.random.default_rng(args.seed)
-        seen = observe(view, config, segmentation="auto", known=None, rng=rng)
-        if seen.view is None or view.labels is None:
-            raise CaryatidError(f"{view.name}: has no masks to compare with")
-        started = time.perf_counter()
-        labels = segment(seen.view, seen.surface, config.segmentation, config.cloud, config.fit, rng)[0]
-        known = {"source": Path(source).name, "view": number, "seconds": time.perf_counter() - started}
-        rows.append(known | compare(labels[view.valid], view.labels[view.valid]))
-    return rows
-
-
-def shares(rows: pd.DataFrame) -> dict[str, float]:
-    """Return the shares of true objects found, split and merged, and the share of segments invented."""
-    sums = rows.sum(numeric_only=True)
-    return {name: sums[name] / max(sums["parts" if name == "invented" else "true"], 1) for name in COUNTED}
-
-
-def measures(rows: pd.DataFrame) -> list[Measure]:
-    """Return the shares of each family of scenes."""
-    return [
-        Measure(f"{name}.{field}", value, "1", "higher" if field == "found" else "lower", 0.02)
-        for name, group in rows.groupby(rows["source"].map(family))
-        for field, value in shares(group).items()
-    ]
-
-
-def main() -> int:
-    """Run the measurement."""
-    args = tyro.cli(Args)
-    console = Console(width=160)
-    parts = args.each(measure, [(source, args) for source in args.sources])
-    rows = pd.DataFrame([row for part in parts for row in part])
-    sums = rows.groupby(rows["source"].map(family).rename("sources")).sum(numeric_only=True)
-    print_table(sums.drop(columns="view").reset_index().round(2), console)
-    worst = rows.loc[(rows["found"] - rows["true"] - rows["invented"]).nsmallest(8).index].itertuples()
-    console.print("worst: " + ", ".join(f"{r.source} view {r.view}: {r.found} of {r.true}" for r in worst))
-    args.write(rows.to_dict("records"))
-    return args.finish(measures(rows), BASELINE, console)
-
-
 if __name__ == "__main__":
-    run_main(main)
+    run_main(Segmentation)

@@ -9,9 +9,8 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from multiprocessing import get_context
@@ -220,26 +219,19 @@ def measure_beside(effort: Effort) -> list[Row]:
         took: dict[int, list[float]] = {0: [], cores: []}
         for _ in range(effort.runs // 3 + 1):
             for count, turns in took.items():
-                episode, looks = Episode(recording, name), zip(recording.poses, recording.views, strict=True)
-                with _busy(count):
-                    _, *later = [episode.look(T_world_camera, view)["turn"] for T_world_camera, view in looks]
-                turns += later
+                episode = Episode(recording, name)
+                busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+                try:
+                    looks = map(episode.look, recording.poses, recording.views)
+                    turns += [laps["turn"] for laps in looks][1:]
+                finally:
+                    for process in busy:
+                        process.kill()
+                        process.wait()
         what = f"view in → next view beside {cores} busy processes, {SEGMENTS[name]}"
         theirs, peer = took[0], "without them"
         rows.append(timed_row(f"turn.{name}.beside", what, took[cores], peer=peer, theirs=theirs, target=3.0))
     return rows
-
-
-@contextmanager
-def _busy(count: int) -> Iterator[None]:
-    """Keep processes busy, and end them."""
-    processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
 
 
 def _stages(recording: Recording, later: dict[str, list[Laps]], effort: Effort) -> list[Row]:
@@ -432,8 +424,8 @@ def measure_growth(axis: str, effort: Effort) -> list[Row]:
         turns = []
         for _, recording in (recordings[0], *recordings):
             episode = Episode(recording, name)
-            took = [episode.look(T, v)["turn"] for T, v in zip(recording.poses, recording.views, strict=True)]
-            turns.append(median(took[1:])[0])
+            took = map(episode.look, recording.poses, recording.views)
+            turns.append(median([laps["turn"] for laps in took][1:])[0])
         rows.append(_exponent(axis, name, [size for size, _ in recordings], turns[1:]))
     return rows
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from caryatid.geometry import transforms
-from caryatid.viz.pdf import find_chromium
+from caryatid.viz.report import find_chromium
 
 ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",

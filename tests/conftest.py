@@ -31,7 +31,7 @@ from caryatid.sensing.views import Cloud
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import ground_truth, write_truth
-from caryatid.viz.pdf import find_chromium
+from caryatid.viz.report import find_chromium
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # The workers share the cores: threads that wait for one that is taken hold up every parallel loop.

@@ -114,8 +114,8 @@ def workplace(prepared, tmp_path, monkeypatch):
     """A copy of these files, in the current folder."""
     place = shutil.copytree(prepared, tmp_path / "here")
     monkeypatch.chdir(place)
-    monkeypatch.setattr("caryatid.cli.benchmark.run_locally", lambda *arguments: (row for row in ()))
-    monkeypatch.setattr("caryatid.cli.benchmark.run_on_cluster", lambda *arguments: (row for row in ()))
+    monkeypatch.setattr("caryatid.cli.results.run_locally", lambda *arguments: (row for row in ()))
+    monkeypatch.setattr("caryatid.cli.results.run_on_cluster", lambda *arguments: (row for row in ()))
     return place
 
 

@@ -39,9 +39,8 @@ from caryatid.viz.drawings import (
     draw_sphere,
 )
 from caryatid.viz.graph_drawing import arrange, draw_graph, layers
-from caryatid.viz.pdf import print_pdf
 from caryatid.viz.pictures import Tag, draw_tags, picture_svg
-from caryatid.viz.report import Figure, Report, make_report, render_html
+from caryatid.viz.report import Figure, Report, make_report, print_pdf, render_html
 from caryatid.viz.scene_3d import scene_3d_html
 from caryatid.viz.tables import object_table
 

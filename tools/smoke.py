@@ -10,21 +10,6 @@ import time
 from importlib.metadata import version
 from pathlib import Path
 
-CLOUD = """
-import numpy as np
-from caryatid.geometry import transforms
-from caryatid.simulation.camera import SimulatedCamera
-from caryatid.simulation.scenes import load_scene
-
-T_world_camera = transforms.look_at(np.array([-1.2, 0.0, 1.5]), np.array([0.0, 0.0, 0.8]))
-view = SimulatedCamera(load_scene("tower")).capture(T_world_camera)
-points = view.points_camera[view.valid]
-header = "ply\\nformat ascii 1.0\\nelement vertex %d\\n" % len(points)
-header += "".join(f"property float {axis}\\n" for axis in "xyz") + "end_header"
-np.savetxt("table.ply", points, "%.5f", header=header, comments="")
-"""
-"""Writes a depth camera's view of a tower to `table.ply`."""
-
 
 def caryatid(*words: str) -> str:
     """Run the installed command as a shell would, and return its output."""
@@ -62,8 +47,7 @@ def main() -> None:
     caryatid("demo", "--scene", "tower", "--views", "2", "--out", "run")
     check(len(Path("run/report.html").read_text()) > 10_000, "the report is empty")
     lap("demo")
-    subprocess.run([sys.executable, "-c", CLOUD], check=True)
-    graph = json.loads(caryatid("extract", "table.ply", "--out", "cloud", "--json"))["graph"]
+    graph = json.loads(caryatid("extract", "sample-cloud", "--out", "cloud", "--json"))["graph"]
     check(len(graph["objects"]) > 3 and len(graph["supports"]) > 2, "too little was found in the cloud")
     lap("extract")
     order = json.loads(caryatid("order", "run", "--set", "rehearsal.draws=2", "--json"))

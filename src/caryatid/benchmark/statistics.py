@@ -175,7 +175,8 @@ def _alone(own: pd.DataFrame, budget: float) -> Iterator[Statistic]:
         means["area", 0.0] = np.sum(f1 * np.diff(begins, append=budget), axis=1) / budget
     yield _plain("budget", 0.0, budget)
     yield from _named(means.columns, bootstrap([means], lambda figures: figures))
-    yield from _by_threshold("mean path", bootstrap([own[name] for name in CURVE], _paths))
+    paths = bootstrap([own[name] for name in CURVE], _paths)
+    yield from _named([("mean path", threshold) for threshold in THRESHOLDS], paths)
     for name in TIMES:
         seconds = own[name].iloc[:, int(name == "planning_seconds") :].to_numpy()
         for quantile in (0.025, 0.5, 0.975) if seconds.size else ():
@@ -195,7 +196,8 @@ def _against(own: pd.DataFrame, other: pd.DataFrame) -> Iterator[Statistic]:
     yield from _named([(f"{name} difference", at) for name, at in own.columns], difference)
     found = bootstrap([frame[name] for frame in (own, other) for name in CURVE], ratios)
     # If the other method does not reach it either, its path is infinite, and the ratio 0.
-    yield from (row for row in _by_threshold("path ratio", found) if 0.0 < row[2] < np.inf)
+    rows = _named([("path ratio", threshold) for threshold in THRESHOLDS], found)
+    yield from (row for row in rows if 0.0 < row[2] < np.inf)
 
 
 def _calibration(episodes: pd.DataFrame) -> Iterator[Statistic]:
@@ -242,7 +244,3 @@ def _sums(forecasts: Sequence[Sequence[float]]) -> Array:
 def _paths(f1: Array, path: Array) -> Array:
     """Path (..., T) [m] at which mean curves (..., V) reach each threshold."""
     return np.stack([_path_to(f1, path, threshold) for threshold in THRESHOLDS], axis=-1)
-
-
-def _by_threshold(quantity: str, found: Array) -> list[Statistic]:
-    return _named([(quantity, threshold) for threshold in THRESHOLDS], found)

@@ -252,7 +252,7 @@ class Export(options.Command, work="results:export_model"):
     """mjcf: free bodies on a table; urdf: links fixed to the world; gltf: meshes; graphml, dot: the graph."""
 
 
-class Benchmark(options.Command, work="benchmark:compare_methods"):
+class Benchmark(options.Command, work="results:compare_methods"):
     """Compare methods over scenes and seeds, and draw figures.
 
     Finished episodes are kept: stop at any time, and run the same command to continue. Without --suite,

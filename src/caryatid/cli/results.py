@@ -1,23 +1,35 @@
-"""`caryatid import`, `evaluate`, `order`, `report` and `export`: commands on recordings and run folders."""
+"""`caryatid import`, `evaluate`, `order`, `report`, `export` and `benchmark`: commands on what is on disk."""
 
 from __future__ import annotations
 
+import os
+import time
+from contextlib import closing
 from pathlib import Path
 
+from rich.progress import MofNCompleteColumn, Progress
+
+from caryatid.benchmark.episodes import Episode, short_name
+from caryatid.benchmark.report import check_reference
+from caryatid.benchmark.report import write_report as write_benchmark
+from caryatid.benchmark.running import run_locally, run_on_cluster
+from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
+from caryatid.benchmark.suites import SUITES, change_suite
 from caryatid.cli import NOT_SAFE
-from caryatid.cli.commands import Evaluate, Export, Import, Order, Report
-from caryatid.cli.output import table
+from caryatid.cli.commands import Benchmark, Evaluate, Export, Import, Order, Report
+from caryatid.cli.output import kept, table
+from caryatid.errors import InputError, needs_extra
 from caryatid.evaluation.truths import evaluate_run
 from caryatid.exports import export_graph, format_of
 from caryatid.io.datasets import OpenOptions
 from caryatid.io.importing import import_recording, reasons
 from caryatid.io.staging import write_file
 from caryatid.manipulation.order import plan_order
+from caryatid.runtime import fingerprint
 from caryatid.runtime.parallel import cores
 from caryatid.sources import open_run, read_model
 from caryatid.steps import read_config, read_steps
-from caryatid.viz.pdf import print_pdf
-from caryatid.viz.report import make_report, read_lift, render_html
+from caryatid.viz.report import make_report, print_pdf, read_lift, render_html
 from caryatid.viz.tables import census, order_line, order_table
 
 
@@ -122,3 +134,76 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
     for path, content in files.items():
         write_file(path, content)
     return list(files)
+
+
+def compare_methods(command: Benchmark) -> None:
+    import_pandas()
+    if command.scheduler is not None:
+        with needs_extra("cluster", "--scheduler"):  # before anything is written
+            import distributed  # noqa: F401
+        if command.jobs is not None:
+            reason = "cannot be combined with --scheduler, which has its own workers"
+            raise InputError("--jobs", reason, "omit one of the two options")
+    suite = None
+    if command.suite is not None:
+        suite = change_suite(
+            SUITES[command.suite],
+            planners=command.planner,
+            fusions=command.fusion,
+            segmentations=command.segmentation,
+            noises=command.noise,
+            preset=command.preset,
+            settings=command.set,
+            scenes=command.scenes,
+            seeds=command.seeds,
+            views=command.views,
+        )
+    with (
+        kept("finished episodes are kept; run the same command to continue"),
+        ResultStore(command.out / RESULTS, fingerprint() if suite else None, collect_provenance()) as store,
+    ):
+        missing = store.plan(command.suite or "", suite.members(), retry=command.retry) if suite else []
+        check_reference(command.reference, store)
+        if command.suite and missing:
+            _run_episodes(command, command.suite, missing, store)
+        _report_benchmark(command, store)
+
+
+def _run_episodes(command: Benchmark, suite: str, missing: list[Episode], store: ResultStore) -> None:
+    """Run the missing episodes with a progress bar; without a terminal, print a line every minute."""
+    output = command.output
+    if command.scheduler is not None:
+        episodes = run_on_cluster(missing, command.scheduler, output.say)
+    else:
+        episodes = run_locally(missing, command.jobs or os.cpu_count() or 1)
+    total = len({member.episode for member in store.suites[suite]})
+    console = output.progress
+    hidden = console.quiet or not console.is_interactive
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    bar = Progress(*columns, console=console, disable=hidden, speed_estimate_period=600.0)
+    task = bar.add_task(suite, total=total, completed=total - len(missing))
+    printed = time.monotonic()
+    with bar, closing(episodes) as outcomes:
+        for done, (episode, outcome) in enumerate(outcomes, start=total - len(missing) + 1):
+            store.add(episode, outcome)
+            bar.advance(task)
+            if outcome.error is not None:
+                name = f"{short_name(episode.scene)}, {episode.planner}, seed {episode.seed}"
+                output.say(f"failed: {name}: {outcome.error}")
+            if hidden and time.monotonic() - printed >= 60.0:
+                printed = time.monotonic()
+                output.say(f"{suite}: {done} of {total} episodes")
+
+
+def _report_benchmark(command: Benchmark, store: ResultStore) -> None:
+    """Write tables, figures and pages, and print the summary."""
+    output, suites = command.output, {}
+    for each in write_benchmark(store, command.out, reference=command.reference, document=command.docs):
+        done, failed = each.episodes, len(each.failures)
+        suites[each.name] = {"planned": each.planned, "done": done, "failed": failed, "f1": each.f1()}
+        output.say(
+            f"{each.name}: {done} of {each.planned} episodes" + (f", {failed} failed" if failed else "")
+        )
+    if suites:
+        output.say(f"figures: {command.out / 'index.html'}")
+    output.result({"results": str(command.out), "suites": suites}, "")

@@ -189,12 +189,8 @@ class LoopPage(Page):
             taken = hands.take(lift, hands.bodies(step.graph))
             film.extend(_without(step, (), lift.object_id, T) for T in _moves(taken, hands.names, before))
             camera.scene = hands.scene
-            done = (
-                f"Removed {lift.object_id}"
-                if taken.body is not None
-                else f"Found nothing at {lift.object_id}"
-            )
-            said = f"{done}; {_moved(taken.disturbed)}."
+            done = "Found nothing at" if taken.body is None else "Removed"
+            said = f"{done} {lift.object_id}; {_moved(taken.disturbed)}."
             harmed.update(taken.disturbed)
             return taken.body is not None
 
@@ -217,13 +213,10 @@ class LoopPage(Page):
     def _show_order(self, step: Step, config: Config) -> str:
         with self.working:
             order = plan_order(step.graph, config, seed=self._options["seed"], threads=cores())
-        facts = [
-            (
-                f"{number}. {lift.object_id}",
-                f"hold {', '.join(lift.hold)}; {lift.why}" if lift.hold else lift.why,
-            )
-            for number, lift in enumerate(order.steps, 1)
-        ]
+        facts = []
+        for number, lift in enumerate(order.steps, 1):
+            held = f"hold {', '.join(lift.hold)}; " if lift.hold else ""
+            facts.append((f"{number}. {lift.object_id}", held + lift.why))
         self._order.content, self._order.visible = cell_html(Section("Order", facts=facts)), True
         rising = [transforms.rigid(np.eye(3), (0.0, 0.0, height)) for height in np.linspace(0.0, 0.5, 8)[1:]]
         gone: set[str] = set()
@@ -387,16 +380,13 @@ def _moves(taken: Taken, names: Sequence[str], before: Array) -> list[dict[str, 
     film = taken.film
     if taken.body is not None:
         film = film[film[:, names.index(taken.body), 2] < ASIDE / 2.0]
-    began = transforms.invert(_transforms(before))
-    moves = [_transforms(state) @ began for state in film]
+    states = np.concatenate([before[None], film])  # (1 + T, N, 7): positions and quaternions, w first
+    poses = np.tile(np.eye(4), (*states.shape[:2], 1, 1))
+    poses[..., :3, 3] = states[..., :3]
+    turns = Rotation.from_quat(states[..., 3:].reshape(-1, 4), scalar_first=True).as_matrix()
+    poses[..., :3, :3] = turns.reshape(*states.shape[:2], 3, 3)
+    moves = poses[1:] @ transforms.invert(poses[0])
     return [{i: T[names.index(body)] for i, body in taken.bodies.items()} for T in moves]
-
-
-def _transforms(state: Array) -> Array:
-    """Poses (N, 4, 4) of a state (N, 7): positions and quaternions, w first."""
-    return np.stack(
-        [transforms.rigid(Rotation.from_quat(s[3:], scalar_first=True).as_matrix(), s[:3]) for s in state]
-    )
 
 
 def _without(step: Step, gone: Collection[str], lifted: str, T_world_world: Mapping[str, Array]) -> Step:

@@ -1,13 +1,17 @@
-"""The report of a run, as one self-contained HTML file."""
+"""The report of a run: one self-contained HTML file, which Chromium prints as a PDF."""
 
 from __future__ import annotations
 
 import io
+import os
+import shutil
+import subprocess
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
@@ -15,6 +19,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from caryatid.config import Config, ReportConfig
+from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.graph import DOUBTFUL, SupportGraph
 from caryatid.manipulation.dismantling import Taken
@@ -52,6 +57,8 @@ SUPPORTS = (
 """Caption of a support graph."""
 WIDE = 680.0
 """Width from which a graph cannot be read in half the page [px]: more than eight vertices side by side."""
+CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+"""What Chromium is called, in order of preference; the environment's CHROMIUM goes before."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -304,7 +311,16 @@ def _figures(step: Step, width: int) -> list[Figure]:
     )
     figures.append(Figure("Fused cloud", draw_cloud(cloud, graph, _first_azimuth(step)), caption))
     if step.candidates is not None or step.decision is not None:
-        figures.append(Figure("Next best view", draw_sphere(step), _sphere_caption(step)))
+        caption = (
+            "The view sphere from above, coloured by saliency; pale views are out of the robot's reach. Rays "
+            "lead from points of interest to the views that show them best. Numbers: views so far."
+        )
+        if step.candidates is not None:
+            counts = step.candidates.rejected.items()
+            refused = ", ".join(f"{count:,} {reason}" for reason, count in counts)
+            caption += f" {len(step.candidates):,} views are reachable"
+            caption += f"; rejected: {refused}." if refused else "."
+        figures.append(Figure("Next best view", draw_sphere(step), caption))
     return figures
 
 
@@ -316,17 +332,6 @@ def sensor_azimuth(cloud: Cloud, T_world_camera: Array | None) -> float:
     elif cloud.viewpoint_world is not None and len(cloud):
         backward = cloud.viewpoint_world - cloud.points_world.mean(axis=0)
     return float(np.arctan2(backward[1], backward[0]))
-
-
-def _sphere_caption(step: Step) -> str:
-    text = (
-        "The view sphere from above, coloured by saliency; pale views are out of the robot's reach. Rays "
-        "lead from points of interest to the views that show them best. Numbers: views so far."
-    )
-    if step.candidates is not None:
-        refused = ", ".join(f"{count:,} {reason}" for reason, count in step.candidates.rejected.items())
-        text += f" {len(step.candidates):,} views are reachable{f'; rejected: {refused}' if refused else ''}."
-    return text
 
 
 # Lifts
@@ -383,7 +388,7 @@ def read_lift(file: Path | BinaryIO) -> Figure:
     return Figure(info.get("heading", ""), picture, info.get("caption", ""), 3)
 
 
-# As HTML
+# As HTML and PDF
 
 
 @cache
@@ -404,3 +409,34 @@ def template(name: str) -> jinja2.Template:
 def render_html(report: Report) -> str:
     """Write a report as one self-contained HTML file."""
     return template("page.html.jinja").render(report=report, svg=picture_svg)
+
+
+def find_chromium() -> str | None:
+    """Path of Chromium, if it is installed."""
+    return os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, CHROMIUM_NAMES)), None)
+
+
+def print_pdf(html: str) -> bytes:
+    """Print a page on A4, with bookmarks.
+
+    Raises:
+        InputError: Chromium is not installed, or does not print the page.
+    """
+    program = find_chromium()
+    if program is None:
+        remedy = "install Chromium or Chrome, or set CHROMIUM to its path"
+        raise InputError("the PDF", "is printed by Chromium, which was not found", remedy)
+    with TemporaryDirectory() as folder:
+        page, printed = Path(folder, "report.html"), Path(folder, "report.pdf")
+        page.write_text(html, encoding="utf-8")
+        options = ["--headless", "--disable-gpu", "--no-pdf-header-footer", "--generate-pdf-document-outline"]
+        options += [f"--user-data-dir={folder}/profile", f"--print-to-pdf={printed}"]
+        if hasattr(os, "geteuid") and os.geteuid() == 0:
+            options.append("--no-sandbox")  # As root, Chromium has none.
+        try:
+            subprocess.run([program, *options, page.as_uri()], check=True, capture_output=True, timeout=120.0)
+            return printed.read_bytes()
+        except (OSError, subprocess.SubprocessError) as error:
+            told = (getattr(error, "stderr", None) or b"").decode(errors="replace").strip() or str(error)
+            reason = f"was not printed by {program} ({told.splitlines()[-1]})"
+            raise InputError("the PDF", reason, "print report.html from a browser") from error
