@@ -13,9 +13,7 @@ from caryatid.config import LiftConfig, PhysicsConfig
 from caryatid.errors import InputError
 from caryatid.geometry.shapes import Box, Shape
 from caryatid.simulation import (
-    GroundTruth,
     SimulatedScene,
-    TrueEdge,
     generate,
     ground_truth,
     list_scenes,
@@ -24,7 +22,6 @@ from caryatid.simulation import (
     static_boxes,
     table_centre,
     true_shapes,
-    write_truth,
 )
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.scenes import DESIGNED, is_builtin
@@ -269,35 +266,3 @@ def test_physics_agrees_with_the_given_ground_truth():
     assert given > 100
     assert common >= 0.98 * given
     assert found - common <= 0.02 * given
-
-
-def test_truth_files_come_back_and_the_kind_may_be_missing(tmp_path: Path):
-    truth, path = ground_truth(load_scene("counterweight")), tmp_path / "gt.json"
-    write_truth(truth, path)
-    assert read_truth(path) == truth
-    edge = {"supporter": "table", "supported": "object0", "kind": "bottom-up"}
-    assert json.loads(path.read_text())["edges"][0] == edge
-    easy = read_truth(write(path, json.dumps(EASY)))
-    assert easy == GroundTruth(("table", "a"), (TrueEdge("table", "a"),))
-    assert easy.pairs == {("table", "a")}
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ('{"vertices": [', "broken JSON"),
-        ("[]", "expected a JSON object"),
-        (json.dumps({**EASY, "vertices": "table"}), "'vertices'"),
-        (json.dumps({**EASY, "vertices": ["table", "a", "a"]}), "twice"),
-        (json.dumps({"vertices": ["table"]}), "'edges'"),
-        (json.dumps({**EASY, "edges": [3]}), "edges: '0' is 3"),
-        (json.dumps({**EASY, "vertices": ["table", "b"]}), "'a', which is not a vertex"),
-        (json.dumps({**EASY, "edges": [{"supported": "a"}]}), "edges.0: the key 'supporter' is missing"),
-        (json.dumps({**EASY, "edges": [{**EASY["edges"][0], "kind": "glue"}]}), "glue.*bottom-up"),
-    ],
-)
-def test_broken_truth_files_are_refused_by_name(tmp_path: Path, text: str, reason: str):
-    path = write(tmp_path / "gt.json", text)
-    with pytest.raises(InputError, match=reason) as error:
-        read_truth(path)
-    assert str(path) in str(error.value)
