@@ -81,30 +81,11 @@ def test_a_lower_side_that_was_seen_stays_where_it_is_and_a_ball_is_known_from_a
     assert (done.shape, done.why) == (known.shape, "")
 
 
-def test_objects_find_those_below_already_completed():
-    middle = thing(1, box((0.0, 0.0, TABLE_TOP + 0.08), (0.1, 0.1, 0.02)), seen=SIDES_AND_TOP)
-    top = thing(2, box((0.0, 0.0, TABLE_TOP + 0.13), (0.08, 0.08, 0.02)), seen=SIDES_AND_TOP)
-    for order in ((middle, top), (top, middle)):
-        done = {o.id: o.shape for o in completed(*order)}
-        assert lowest(done["o1"]) == pytest.approx(TABLE_TOP)
-        assert abs(lowest(done["o2"]) - highest(done["o1"])) <= CONFIG.overlap
-
-
 def test_what_sticks_in_the_table_is_cut_off_at_its_top():
     sunk = box((0.0, 0.0, TABLE_TOP + 0.02), (0.1, 0.1, 0.06))
     (done,) = completed(thing(1, sunk, seen=SIDES_AND_TOP))
     assert lowest(done.shape) == pytest.approx(TABLE_TOP)
     assert highest(done.shape) == pytest.approx(highest(sunk))
-
-
-@pytest.mark.parametrize(("tilt_deg", "extended"), [(15.0, True), (45.0, False)])
-def test_only_a_side_that_faces_down_is_one_to_rest_on(tilt_deg, extended):
-    R = transforms.rotation_from_vector((np.radians(tilt_deg), 0.0, 0.0))
-    tilted = cylinder((0.0, 0.0, 0.0), 0.02, 0.06).moved(transforms.rigid(R, (0.0, 0.0, TABLE_TOP + 0.1)))
-    (done,) = completed(thing(1, tilted, seen=SIDES_AND_TOP))
-    assert (done.shape.height > tilted.height) == extended
-    # The face is tested at points, not on all of its rim.
-    assert lowest(done.shape) >= TABLE_TOP - 0.001
 
 
 def test_a_front_alone_is_taken_to_be_as_deep_as_wide_within_free_space():

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
-from synthetic import box, cylinder, hausdorff, random_motion, seen_free, sphere, surface_points
+from synthetic import box, cylinder, hausdorff, seen_free, sphere, surface_points
 
 from caryatid.config import FitConfig
-from caryatid.fitting import primitives
 from caryatid.fitting.hidden_faces import close_hidden_faces
 from caryatid.fitting.primitives import Fit, FitFailure, candidates, fit, free_inside
 from caryatid.geometry import transforms
@@ -89,19 +87,6 @@ def test_the_sides_that_points_bear_out_are_the_ones_seen():
     assert seen == {(-1, 0, 0), (0, 1, 0), (0, 0, 1)}
 
 
-def test_one_face_alone_makes_a_slab_behind_it():
-    shape = box((0.0, 0.0, 0.0), (0.08, 0.12, 0.1), turn_deg=30.0)
-    points, normals = surface_points(shape, np.random.default_rng(0), sigma=0.001)
-    top = normals[:, 2] > 0.9
-    result = fit_of(points[top], normals[top])
-    assert isinstance(result.shape, Box)
-    np.testing.assert_allclose(np.sort(result.shape.extents)[1:], (0.08, 0.12), atol=0.006)
-    assert np.sort(result.shape.extents)[0] < 0.02
-    height = result.shape.T_world_object[2, 3] + result.shape.support(np.array([[0.0, 0.0, 1.0]]))[0]
-    assert height == pytest.approx(0.05, abs=0.001)
-    assert sum(result.seen) == 1
-
-
 @pytest.mark.parametrize("count", [0, 3, CONFIG.min_points - 1])
 def test_too_few_points_are_a_clear_failure(count):
     points, normals = surface_points(SHAPES[0], np.random.default_rng(0))
@@ -137,81 +122,7 @@ def test_only_the_shapes_that_are_asked_for_are_tried(kind, shape):
 # Other frames and layouts
 
 
-@each
-def test_a_fit_does_not_depend_on_where_the_points_lie_and_in_which_order(shape):
-    """Coordinates have 1e-13 m of rounding a kilometre away, and the shape moves with them."""
-    rng = np.random.default_rng(0)
-    points, normals = surface_points(shape, rng, eye=EYE, sigma=0.002)
-    normals = noisy_normals(normals, rng)
-    here = fit_of(points, normals)
-    for T in (transforms.rigid(np.eye(3), (1000.0, -1000.0, 1000.0)), random_motion(rng, 2.0)):
-        there = fit_of(transforms.transform(T, points), transforms.rotate(T, normals)).shape
-        assert there.kind == here.shape.kind
-        assert hausdorff(there, here.shape.moved(T)) < 1e-5
-    order = rng.permutation(len(points))  # Other samples are drawn: the best of them are refined.
-    shuffled = fit_of(points[order], normals[order])
-    assert shuffled.shape.kind == here.shape.kind
-    assert abs(shuffled.residual - here.residual) < 0.0005
-
-
-def test_arrays_of_any_layout_give_the_same_fit():
-    points, normals = surface_points(SHAPES[2], np.random.default_rng(0), eye=EYE, sigma=0.001)
-    expected = fit_of(points, normals)
-    points.flags.writeable = normals.flags.writeable = False  # What is handed in stays as it is.
-    strided = np.repeat(points, 2, axis=0)[::2]
-    no_numbers = np.full((30, 3), np.nan)
-    for p, n in (
-        (points, normals),
-        (np.asfortranarray(points), np.asfortranarray(normals)),
-        (strided, normals),
-        (np.concatenate([points, no_numbers]), np.concatenate([normals, no_numbers])),
-    ):
-        assert fit_of(p, n).cost == expected.cost
-    single = fit_of(points.astype(np.float32), normals.astype(np.float32))
-    assert hausdorff(single.shape, expected.shape) < 0.0005
-
-
-CLOUD = np.random.default_rng(0).uniform(-0.05, 0.05, (60, 3))
-UP = np.tile((0.0, 0.0, 1.0), (60, 1))
 SECOND = np.arange(60)[:, None] % 2 == 1
-NORMALS = {
-    "up": UP,
-    "any way": transforms.unit(np.random.default_rng(1).normal(size=(60, 3))),
-    "up and down": np.where(SECOND, UP, -UP),
-    "no direction": 0.0 * UP,
-    "half no numbers": np.where(SECOND, UP, np.nan),
-}
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("normals", NORMALS)
-@pytest.mark.parametrize("spread", list(product((0.0, 1.0), repeat=3)))
-def test_points_that_determine_no_shape_do_not_break_it(spread, normals):
-    """On a spot, a line or a plane, far away or wide; what comes out, if anything, is finite."""
-    flat = CLOUD * spread
-    spoilt = flat.copy()
-    spoilt[:3, 0] = np.nan, np.inf, -np.inf
-    slanted = flat @ transforms.random_rotation(np.random.default_rng(2)).T
-    clouds = [flat, slanted, flat + 1000.0, 1e5 * flat, 1e200 * flat, spoilt, np.full((60, 3), np.nan)]
-    clouds += [flat[:count] for count in (0, 1, 2, CONFIG.min_points)]
-    for points in clouds:
-        for least in (CONFIG.min_points, 1):
-            check(points, NORMALS[normals][: len(points)], least)
-
-
-def check(points, normals, least):
-    config = replace(CONFIG, min_points=least)
-    result = fit(points, normals, config=config, rng=np.random.default_rng(0))
-    if isinstance(result, FitFailure):
-        assert result.reason
-        return
-    assert (np.isfinite(points) & np.isfinite(normals)).all(axis=1).sum() >= least
-    assert np.isfinite(result.shape.T_world_object).all()
-    assert (result.shape.extents >= 0.99 * CONFIG.min_extent).all()
-    assert (result.shape.extents <= CONFIG.max_extent).all()
-    assert np.isfinite([result.residual, result.inliers, result.cost]).all()
-    for deviation in (result.uncertainty.position, result.uncertainty.sizes, result.uncertainty.sides):
-        assert np.isfinite(deviation).all()
 
 
 INDEPENDENT = FitConfig(correlated=1.0, registration=0.0, rim=0.0)
@@ -291,15 +202,3 @@ def test_half_of_a_shape_in_free_space_is_half_free(shape):
         voxels = seen_free(lambda p, start=start: p[:, 0] > start)
         inside, free = free_inside(shape, voxels, INSET)
         assert free / inside == share
-
-
-def test_of_shapes_that_explain_the_points_the_one_that_fills_no_space_seen_free(monkeypatch):
-    monkeypatch.setattr(primitives, "FREE_WEIGHT", 1.0)
-    can = cylinder((0.0, 0.0, 0.2), 0.06, 0.12)
-    points, normals = surface_points(can, np.random.default_rng(0), eye=(-1.0, 0.3, 0.6), sigma=0.001)
-    best, other, *_ = candidates_of(points, normals)
-    inside_best_alone = seen_free(
-        lambda p: (best.shape.signed_distance(p) < 0.0) & (other.shape.signed_distance(p) > -INSET)
-    )
-    options = {"config": CONFIG, "rng": np.random.default_rng(0), "space": inside_best_alone}
-    assert fit(points, normals, **options).shape.kind != best.shape.kind

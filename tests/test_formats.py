@@ -20,6 +20,7 @@ from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere, Uncertainty
+from caryatid.geometry.solids import Polytope, Solid
 from caryatid.graph import SceneObject, Stability, Support, SupportGraph
 from caryatid.io import (
     graph_from_json,
@@ -61,6 +62,7 @@ def make_graph(rng):
         SceneObject("o1", 1, Box(T[0], rng.uniform(0.02, 0.3, 3)), **known),
         SceneObject("o2", 2, Cylinder(T[1], 0.04, 0.1)),
         SceneObject("o3", 3, Sphere(T[2], 0.05)),
+        SceneObject("o4", 4, Solid.of([Polytope.around(Box(t, np.ones(3)).outline()) for t in T[:2]])),
     )
     supports = (
         Support("o0", "o1"),
@@ -72,7 +74,7 @@ def make_graph(rng):
 
 
 def everything(graph):
-    return json_text({"all": [asdict(item) for item in (*graph.objects, *graph.supports)]})
+    return json_text({"all": [asdict(item) for item in (*graph.objects[:4], *graph.supports)]})
 
 
 def test_a_graph_is_read_back():
@@ -132,6 +134,8 @@ SUPPORT = {"supporter": "o0", "supported": "o1", "kind": "bottom-up"}
         (("objects", 1, "shape", "banana"), "banana"),
         (("objects", 1, "size", [0.1, -0.1, 0.1]), "not positive"),
         (("objects", 1, "occurrences", -3), "occurrences"),
+        (("objects", 1, "size", [0.1, 0.2]), "no shape 'box'"),
+        (("objects", 1, "size", {"radius": 0.1}), "no shape 'box'"),
         (("objects", 1, "seen", [True]), "seen"),
         (("objects", 1, "uncertainty", {"position": [0.1, 0.1, 0.1]}), "'rotation' is missing"),
         (("objects", 1, 7), "must be an object"),

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import random_motion
 
 from caryatid.geometry import transforms
-from caryatid.io.video import SECOND, TransformTree, is_pose
+from caryatid.io.video import SECOND, TransformTree
 
 NOW = 1_700_000_000 * SECOND
 """Large enough that a float would lose the nanoseconds."""
@@ -88,10 +88,3 @@ def test_frames_in_a_circle_and_frames_apart_are_refused():
     for target in ("c", "nowhere"):
         assert tree.between(target, "a", NOW) is None
     assert tree.frames == ["a", "b", "c", "d"]
-
-
-@pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (np.nan, 0.0, 0.0, 1.0)])
-def test_numbers_that_are_no_rotation_make_no_pose(q):
-    assert not is_pose((0.0, 0.0, 0.0, *q))
-    assert not is_pose((np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
-    assert not is_pose((0.0, 0.0, 0.0, 1.0))

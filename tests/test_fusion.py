@@ -14,7 +14,6 @@ from synthetic import (
     sphere,
     table_object,
     thing,
-    vertices,
 )
 
 from caryatid.config import FusionConfig
@@ -114,15 +113,6 @@ def test_what_a_new_view_calls_otherwise_gets_its_old_name():
     assert {o.id: o.label for o in fused.objects} == {"o0": table_object().label, "o1": 1, "o2": 2}
 
 
-def test_a_new_object_gets_a_name_that_was_never_used():
-    stranger = graph(("o0", "o1"), shapes={1: BALL})
-    graphs, names = fuse(together(FULL), stranger, SG, same_labels=False)
-    assert names["o1"] == "o3"
-    fused = fused_graph(graphs, SG)
-    assert [(o.id, o.label) for o in fused.objects[1:]] == [("o1", 1), ("o2", 2), ("o3", 3)]
-    assert [s.pair for s in fused.supports] == [("o0", "o1"), ("o0", "o3"), ("o1", "o2")]
-
-
 GONE = graph(("o0", "o1"), shapes={1: CRATE})
 
 
@@ -163,31 +153,6 @@ def test_which_edges_each_method_keeps_found_in_views_true_and_not_in_views_fals
     strict, mild = replace(SG, keep_share=0.8), replace(SG, keep_share=0.3)
     assert (("o1", "o2") in edges(fused_of(*graphs, config=strict))) == (sum(found) / len(found) > 0.8)
     assert (("o1", "o2") in edges(fused_of(*graphs, config=mild))) == any(found)
-
-
-def test_sg_merges_the_shapes_and_pc_holds_what_the_newest_graph_holds():
-    shifted = graph(shapes={1: CRATE.moved(shift(0.01)), 2: CAN})
-    for config, x, stays in ((SG, 0.005, True), (PC, 0.01, False), (BOTH, 0.01, True)):
-        assert fused_of(FULL, shifted, config=config)["o1"].centre_world[0] == pytest.approx(x)
-        assert ("o2" in vertices(fused_of(FULL, GONE, config=config))) == stays
-
-
-def test_an_edge_is_certain_where_a_view_was_certain_of_it():
-    unsure = graph(("o0", "o1"), ("o1", "o2"), certain=False)
-    for order in ((FULL, unsure), (unsure, FULL)):
-        assert fused_of(*order).support("o1", "o2").certain
-    assert not fused_of(unsure, unsure).support("o1", "o2").certain
-    assert not fused_of(FULL, unsure, config=BOTH).support("o1", "o2").certain
-
-
-def test_a_support_that_a_view_lacks_is_doubtful():
-    likely = replace(FULL, supports=tuple(replace(s, probability=1.0) for s in FULL.supports))
-    fused = fused_graph((likely, likely, graph(("o0", "o1"))), replace(SG, keep_share=0.5))
-    assert not fused.support("o0", "o1").doubtful
-    support = fused.support("o1", "o2")
-    assert support.probability == pytest.approx(2.0 / 3.0)
-    assert support.certain
-    assert support.doubtful
 
 
 @pytest.mark.parametrize("earlier", [0.95, 0.6])

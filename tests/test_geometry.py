@@ -11,7 +11,7 @@ import shapely
 from scipy.spatial import ConvexHull, cKDTree
 from synthetic import random_motion, table_object, thing
 
-from caryatid.config import ActiveVisionConfig, SupportConfig
+from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.exports import export_graph
 from caryatid.geometry import transforms
@@ -25,10 +25,8 @@ from caryatid.geometry.shapes import (
     Shape,
     Sphere,
     fibonacci_sphere,
-    from_size,
 )
 from caryatid.io.graph_json import graph_text, read_graph
-from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.support.relations import infer
 
 T = random_motion(np.random.default_rng(1))
@@ -72,14 +70,6 @@ def test_a_surface_of_too_many_points_is_refused(shape, spacing):
 
 
 @each
-def test_distances_are_those_to_the_nearest_point_of_the_surface(shape):
-    surface, _ = shape.surface(0.002)
-    points, _ = around(shape, 400)
-    gap, _ = cKDTree(surface).query(points)
-    np.testing.assert_allclose(np.abs(shape.signed_distance(points)), gap, atol=0.0021)
-
-
-@each
 def test_the_volume_is_that_of_the_points_inside(shape):
     points, cube = around(shape)
     share = (shape.signed_distance(points) < 0.0).mean()
@@ -104,45 +94,6 @@ def test_the_outline_spans_the_shape(shape):
     hull = ConvexHull(shape.outline())
     assert hull.volume == pytest.approx(shape.volume, rel=0.03)
     assert shape.signed_distance(shape.outline()).max() < 1e-9
-
-
-@pytest.mark.parametrize(
-    ("kind", "size"),
-    [
-        ("cone", {"radius": 0.1, "height": 0.1}),
-        ("box", [0.1, 0.2]),
-        ("box", ["wide", 0.1, 0.1]),
-        ("box", {"radius": 0.1}),
-        ("cylinder", {"radius": 0.1}),
-        ("sphere", [0.1]),
-        ("sphere", {"radius": None}),
-    ],
-)
-def test_sizes_that_do_not_fit_the_shape_are_refused(kind, size):
-    with pytest.raises(InputError, match=f"no shape '{kind}'") as caught:
-        from_size(kind, np.eye(4), size, "graph.json")
-    assert "a cylinder {radius, height}" in str(caught.value)
-    with pytest.raises(InputError, match="T_world_object"):
-        from_size("sphere", 2.0 * np.eye(4), {"radius": 0.1}, "graph.json")
-
-
-def test_the_fibonacci_sphere_is_even():
-    directions = fibonacci_sphere(2000)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
-    gap, _ = cKDTree(directions).query(directions, k=2)
-    # Each has a cell of 4π/2000: neighbours are about its width apart, nowhere half or twice that.
-    width = np.sqrt(4.0 * np.pi / 2000)
-    assert gap[:, 1].min() > 0.5 * width
-    assert gap[:, 1].max() < 1.2 * width
-
-
-@each
-def test_gradients_point_away_from_the_surface(shape):
-    points, _ = around(shape, 200)
-    distances, outward = Primitives.of([shape]).gradient(0, points)
-    np.testing.assert_allclose(distances, shape.signed_distance(points), atol=1e-12)
-    steps = shape.signed_distance(points + 1e-7 * outward) - distances
-    np.testing.assert_allclose(steps, 1e-7, atol=1e-9)
 
 
 @each
@@ -326,16 +277,3 @@ def test_rays_out_of_the_far_corner_stay_within_the_grid():
         met = voxels(np.array(GRID, dtype=float), np.array(ray), 0.0, 2.0)
         assert met.min(initial=0) >= 0
         assert met.max(initial=0) < np.prod(GRID)
-
-
-VIEW_SPHERE = ViewSphere.around((0.1, -0.2, 0.75), ActiveVisionConfig(sphere_points=2000))
-
-
-def test_poses_look_at_the_centre_like_look_at_does_and_tell_where_they_came_from():
-    directions = np.vstack([VIEW_SPHERE.directions[::50], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    poses = VIEW_SPHERE.poses(directions)
-    for T, d in zip(poses, directions, strict=True):
-        expected = transforms.look_at(VIEW_SPHERE.centre_world + 1.5 * d, VIEW_SPHERE.centre_world)
-        np.testing.assert_allclose(T, expected, atol=1e-9)
-        np.testing.assert_allclose(VIEW_SPHERE.direction_of(T), d, atol=1e-12)
-    np.testing.assert_allclose(VIEW_SPHERE.direction_of(poses), directions, atol=1e-12)

@@ -61,14 +61,6 @@ def test_of_overlapping_scores_the_largest_is_on_top():
     assert view.labels_are == "segments"
 
 
-def test_bytes_are_masks_too_and_nothing_is_changed():
-    masks = np.stack([square(5, 30), square(31, 50)])
-    given = masks.astype(np.uint8) * 255
-    before = given.copy()
-    np.testing.assert_array_equal(labels_from_masks(given), labels_from_masks(masks))
-    np.testing.assert_array_equal(given, before)
-
-
 @pytest.mark.parametrize(
     ("masks", "scores", "what"),
     [

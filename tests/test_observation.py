@@ -20,15 +20,6 @@ def observation_of(source, segmentation=None, known=None, config=CONFIG):
     return observe(source, config, segmentation=segmentation, known=known, rng=np.random.default_rng(0))
 
 
-def test_labelled_points_below_the_known_table_are_kept():
-    known = observation_of(VIEW).surface
-    floor = observation_of(VIEW, "labels")
-    pixels = floor.pixels[floor.cloud.points_world[:, 2] < 0.1][:500]
-    labels = VIEW.labels.copy()
-    labels.ravel()[pixels] = 77
-    assert (observation_of(replace(VIEW, labels=labels), "labels", known=known).labels == 77).sum() == 500
-
-
 @pytest.mark.parametrize("source", [VIEW, simulated_cloud("tower")], ids=["view", "cloud"])
 def test_labels_that_are_demanded_and_missing_are_an_error(source):
     with pytest.raises(InputError, match="has no labels") as caught:
@@ -59,14 +50,6 @@ def test_a_view_in_which_the_table_is_not_seen_keeps_the_one_known(rise):
     elsewhere = observation_of(replace(VIEW, T_world_camera=T, labels=None), "auto", known=known)
     assert elsewhere.surface is known
     assert rise > 0 or not elsewhere.labels.any()
-
-
-def test_the_table_is_looked_for_near_where_it_was():
-    known = observation_of(VIEW).surface
-    T = VIEW.pose.copy()
-    T[2, 3] += 0.01
-    shifted = observation_of(replace(VIEW, T_world_camera=T), known=known)
-    assert shifted.surface.point_world[2] == pytest.approx(TABLE_TOP + 0.01, abs=0.001)
 
 
 def test_a_cloud_in_its_sensors_frame_is_levelled():

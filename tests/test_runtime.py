@@ -7,13 +7,10 @@ import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 from conftest import SMALL
-from numba import njit
 
 from caryatid.runtime import parallel
-from caryatid.runtime.parallel import for_each
 
 # Sharing work out
 
@@ -58,19 +55,6 @@ assert threads() == usual, threads()
 @pytest.mark.parametrize("order", ["01", "10"])
 def test_blas_gets_its_threads_back_after_functions_that_overlap(order):
     subprocess.run([sys.executable, "-c", OVERLAPPING, *order], check=True, timeout=60.0)
-
-
-@njit
-def add_scaled(index, data):
-    numbers, factor, results = data
-    results[index] += factor * numbers[index]
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 100])
-def test_each_piece_of_work_is_done_once(count):
-    numbers, results = np.arange(100.0), np.zeros(100)
-    for_each(add_scaled, count, (numbers, 3.0, results))
-    np.testing.assert_array_equal(results, np.where(np.arange(100) < count, 3.0 * numbers, 0.0))
 
 
 # Kernels on disk

@@ -16,7 +16,7 @@ from caryatid.config import CloudConfig
 from caryatid.errors import PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Cylinder
-from caryatid.sensing.clouds import oriented_points, thin
+from caryatid.sensing.clouds import oriented_points
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.generation import bowl
@@ -219,19 +219,6 @@ def test_without_a_pose_table_and_objects_are_found(turned):
     labels = np.where(scene.labels == SUPPORT_LABEL, 0, scene.labels)
     assert found(labels, view.labels) == (3, 3, 3)
     assert scene.T_world_camera[2, 3] == pytest.approx(view.pose[2, 3] - TABLE, abs=0.01)
-
-
-def test_a_cloud_comes_apart_like_the_view():
-    points, normals, truth = [], [], []
-    for azimuth in (0, 120, 240):
-        view = table_scene(from_the_side(azimuth), STACK, [BALL], sigma=0.001)
-        p, n, pixels = oriented_points(view, CloudConfig())
-        points.append(p)
-        normals.append(n)
-        truth.append(view.labels.ravel()[pixels])
-    index = thin(np.concatenate(points), 0.005)
-    cloud = Cloud(np.concatenate(points)[index], np.concatenate(normals)[index])
-    assert found(labels_of(cloud), np.concatenate(truth)[index]) == (3, 3, 3)
 
 
 def test_masks_that_are_too_wide_label_nothing_far_behind_their_objects():

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from caryatid.config import Config
-from caryatid.errors import InputError
 from caryatid.evaluation.scores import as_scene, score
 from caryatid.exploration import explore
 from caryatid.exports import export_graph
@@ -15,7 +14,6 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Sphere
 from caryatid.geometry.solids import Polytope, Solid, hollowed
 from caryatid.graph import SceneObject, SupportGraph
-from caryatid.io.graph_json import graph_from_json, graph_to_json
 from caryatid.simulation.generation import generate
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth
@@ -93,36 +91,10 @@ def test_what_stands_in_a_tray_is_supported_by_it_all_over():
     assert graph.stability["o1"].ratio == pytest.approx(1.0)
 
 
-def test_what_floats_over_the_floor_of_a_tray_lands_on_it():
-    graph = infer(on_a_table(tray(), cube((0.0, 0.0, 0.05))), Config().support)
-    assert "gap 20.0 mm" in graph.support("o1", "o2").why
-
-
-def test_a_solid_is_drawn_without_the_seams_between_its_parts():
-    corners = np.indices((2, 2, 2)).reshape(3, -1).T / 10.0
-    two = Solid.of([Polytope.around(corners + (x, 0.0, 0.0)) for x in (0.0, 0.1)])
-    seen = np.concatenate(two.lines(np.array([1.0, 2.0, 3.0]))).reshape(-1, 33, 3)
-    for lines in (two.creases(), seen):
-        assert len(lines) == 16
-        assert (np.abs(lines[..., 0] - 0.1).max(axis=1) > 0.01).all()
-
-
 def test_a_solid_scores_with_its_inside():
     """The block has the same hull as the tray: IoU 1, though the tray fills a third of it."""
     of_tray, of_block = (SupportGraph(tuple(on_a_table(shape))) for shape in (tray(), BLOCK))
     assert score(of_tray, as_scene(of_block)).mean_iou > 0.99
-
-
-def test_graph_json_keeps_the_corners_of_the_parts():
-    graph = SupportGraph(tuple(on_a_table(tray((0.1, 0.0, 0.0)))))
-    document = graph_to_json(graph)
-    assert document["objects"][1]["shape"] == "solid"
-    assert [len(part) for part in document["objects"][1]["size"]["parts"]] == [8] * 5
-    again = graph_from_json(document, "test")
-    assert graph_to_json(again) == document
-    document["objects"][1]["size"] = {"parts": [[[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]]}
-    with pytest.raises(InputError, match="no shape 'solid'"):
-        graph_from_json(document, "test")
 
 
 @pytest.mark.parametrize("name", ["tray.xml", "tray.urdf", "tray.glb", "tray.graphml", "tray.dot"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -333,33 +332,6 @@ class TestInfer:
                 explain(graph, *pair, CONFIG)
 
 
-SCENES = Path(__file__).parents[2] / "shared" / "scenes"
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not SCENES.is_dir(), reason="needs ../shared/scenes")
-def test_true_shapes_of_the_shared_primitive_scenes_give_their_edges():
-    from caryatid.simulation.scenes import load_scene
-    from caryatid.simulation.truth import read_truth
-    from caryatid.simulation.world import static_boxes, true_shapes
-
-    right = wrong = missed = 0
-    for folder in [f for f in sorted(SCENES.iterdir()) if not f.name.startswith(("ycb", "house", "storey"))]:
-        loaded = load_scene(str(folder / "scene.xml"))
-        names = {0: "table", **loaded.object_bodies}
-        objects = [
-            SceneObject(names[k], k, shape, "object" if k else "support_surface")
-            for k, shape in {0: static_boxes(loaded)[0], **true_shapes(loaded)}.items()
-        ]
-        truth = read_truth(folder / "gt.json").pairs
-        found = set(edges(infer(objects, CONFIG)))
-        right += len(found & truth)
-        wrong += len(found - truth)
-        missed += len(truth - found)
-    assert right / (right + wrong) >= 0.97
-    assert right / (right + missed) >= 0.97
-
-
 class TestProbabilities:
     def likely(self, objects, config=CONFIG, seed=0):
         return {s.pair: s.probability for s in infer(objects, config, np.random.default_rng(seed)).supports}
@@ -399,12 +371,6 @@ class TestProbabilities:
         _, sure = infer(scene(cube(0, 0, 0.05), uncertainty=unsure(0.001)), CONFIG).objects
         assert sure.probability == 1.0
         assert 0.3 < guessed.probability < 0.9
-
-    def test_draws_come_from_the_generator(self):
-        objects = [replace(o, uncertainty=unsure(0.003, 0.01)) for o in counterweight()[1:]]
-        objects = [SURFACE, *objects]
-        assert self.likely(objects, seed=1) == self.likely(objects, seed=1)
-        assert self.likely(objects, seed=1) != self.likely(objects, seed=2)
 
 
 LEGS = [block(x, y, 0, (0.05, 0.05, 0.1)) for x in (-0.1, 0.1) for y in (-0.1, 0.1)]
@@ -474,13 +440,12 @@ def thing(label, centre, known, size=(0.1, 0.1, 0.1)):
     return SceneObject(f"o{label}", label, Box(rigid(np.eye(3), centre), np.array(size)), uncertainty=known)
 
 
-HOVERING = (0.0, 0.0, 0.055)
 CAN = Cylinder(at(0, 0, 0.05), 0.04, 0.1)
 
 
 class TestReconcile:
     @pytest.mark.parametrize(
-        "shape", [cube(*HOVERING), Cylinder(at(*HOVERING), 0.03, 0.1), Sphere(at(*HOVERING), 0.05)]
+        "shape", [cube(0, 0, 0.055), Cylinder(at(0, 0, 0.055), 0.03, 0.1), Sphere(at(0, 0, 0.055), 0.05)]
     )
     def test_what_hovers_is_let_down_onto_what_carries_it(self, shape):
         hovering = SceneObject("o1", 1, shape, uncertainty=unsure(0.004))
@@ -516,9 +481,3 @@ class TestReconcile:
         table, after = reconcile([SURFACE, floating], PLAUSIBLE)
         assert after.doubt == "floats over o0 by 8 mm, more than both fits explain"
         assert table.doubt == ""
-
-    def test_without_uncertainty_or_rounds_nothing_moves(self):
-        unknown = [SURFACE, thing(1, (0, 0, 0.045), None)]
-        np.testing.assert_array_equal(reconcile(unknown, PLAUSIBLE)[1].centre_world, (0, 0, 0.045))
-        sure = [SURFACE, thing(1, (0, 0, 0.048), unsure(0.01))]
-        assert reconcile(sure, replace(PLAUSIBLE, rounds=0))[1] is sure[1]

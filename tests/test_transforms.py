@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
@@ -54,13 +53,6 @@ def test_other_matrices_than_rigid_transforms_are_refused_by_name_and_reason(T, 
 def test_angles_are_exact_where_the_arc_cosine_is_not(angle):
     turned = [np.cos(angle), np.sin(angle), 0.0]
     assert transforms.angle_between([2.0, 0.0, 0.0], turned) == pytest.approx(angle, rel=1e-6, abs=1e-15)
-
-
-@pytest.mark.parametrize("length", [0.0, 1e-15, 1e-7, 5e-4, 0.3, 3.0])
-def test_rotation_vectors_follow_rodrigues(length, rng):
-    vector = length * transforms.unit(rng.normal(size=3))
-    expected = Rotation.from_rotvec(vector).as_matrix()
-    np.testing.assert_allclose(transforms.rotation_from_vector(vector), expected, atol=1e-14)
 
 
 def test_looking_at_a_point_puts_it_on_the_axis_with_up_upwards(rng):

@@ -19,15 +19,6 @@ def wall_view(distance: float = 1.0, noise: np.ndarray | float = 0.0) -> View:
     return View(depth, K, T_world_camera)
 
 
-def test_a_new_map_knows_nothing():
-    voxels = VoxelMap.around((0.1, 0.2, 0.3), CONFIG)
-    assert voxels.states.shape == (40, 40, 30)
-    assert (voxels.states == UNKNOWN).all()
-    np.testing.assert_allclose(voxels.origin_world, (-0.3, -0.2, 0.1))
-    assert not voxels.occluders().blocked(np.zeros((2, 3)), np.ones((3, 3)), 0.0).any()
-    assert not voxels.occluders().holds(np.zeros((2, 3))).any()
-
-
 def test_a_view_clears_its_rays_and_fills_their_ends():
     before = VoxelMap.around((0.0, 0.0, 0.0), CONFIG)
     voxels = before.integrate(wall_view(), 3.0)
@@ -42,20 +33,6 @@ def test_readings_beyond_the_range_are_free_space_up_to_it_and_none_say_nothing(
     assert voxels.state_at(np.array([[0.05, 0.01, 0.01], [0.15, 0.01, 0.01]])).tolist() == [FREE, UNKNOWN]
     assert not (voxels.states == OCCUPIED).any()
     assert (empty.integrate(wall_view(distance=0.0), 3.0).states == UNKNOWN).all()
-
-
-def test_a_surface_survives_depth_noise_and_a_registration_error():
-    rng = np.random.default_rng(2)
-    voxels = VoxelMap.around((0.0, 0.0, 0.0), CONFIG)
-    offsets = [0.0, 0.01, -0.01]
-    for offset in offsets:
-        noise = rng.normal(0.0, 0.003, (120, 160))
-        voxels = voxels.integrate(wall_view(1.0 + offset, noise), 3.0)
-    y, z = np.meshgrid(np.linspace(-0.3, 0.3, 31), np.linspace(-0.15, 0.3, 21))
-    points = np.column_stack([np.full(y.size, -0.25), y.ravel(), z.ravel()])
-    targets = np.array([[0.4, 0.0, 0.0]])
-    assert voxels.occluders().blocked(points, targets, 0.0).all(), "there is a hole in the wall"
-    assert (voxels.state_at(points) == FREE).all()
 
 
 def test_a_stray_reading_is_gone_after_three_views_through_it():
