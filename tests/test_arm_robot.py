@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from arms import LIMITS, assert_gaze, base_at, gantry, sideways_only, within_arms_length
+from arms import assert_gaze, base_at, sideways_only, within_arms_length
 from synthetic import FEW_VIEWS, SENSOR, look_from
 from test_docs import ROOT, blocks
 
@@ -16,7 +16,6 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
 from caryatid.robots.arm import RADIUS_SHARE, REASONS, UNCONFIRMED, ArmRobot
 from caryatid.robots.floor import FloorGrid
-from caryatid.robots.reachability import sample_reachability
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation import load_scene
 from caryatid.simulation.camera import SimulatedCamera
@@ -128,21 +127,6 @@ class TestCandidates:
         kept.confirm(views[0])
         solution[:] = 0.5  # the next answer is written into the same array
         np.testing.assert_array_equal(kept.waypoints(views[0])[0].joints, [0.1, 0.2])
-
-    @pytest.mark.parametrize("seed", range(2))
-    def test_base_and_table_moved_together_change_nothing(self, seed):
-        rng = np.random.default_rng(seed)
-        T = base_at(*rng.uniform(-3.0, 3.0, 3), float(rng.uniform(-180.0, 180.0)))
-        there = replace(PROPOSED, centre_world=transforms.transform(T, PROPOSED.centre_world))
-        reach = sample_reachability(gantry, LIMITS, 20_000, rng, CONFIG)
-        for reachable in (within_arms_length, sideways_only, reach):
-            robot, moved = arm(reachable), arm(reachable, T @ BASE)
-            here = offered(robot)
-            elsewhere = moved.candidates(moved.view_sphere(there))
-            assert moved.view_sphere(there).radius == robot.view_sphere(PROPOSED).radius
-            assert elsewhere.rejected == here.rejected
-            np.testing.assert_array_equal(elsewhere.indices, here.indices)
-            np.testing.assert_allclose(elsewhere.T_world_camera, T @ here.T_world_camera, atol=1e-9)
 
 
 @pytest.mark.parametrize(

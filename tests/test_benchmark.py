@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -359,18 +357,3 @@ def test_a_document_can_be_made_again_of_the_summary(tmp_path):
     assert [file.name for file in one] == [file.name for file in other]
     assert one[-1].read_text() == other[-1].read_text() != ""
     assert len(one) > 3
-
-
-def test_a_full_disk_keeps_the_older_results(tmp_path, monkeypatch):
-    def full(path, mode):
-        path.touch()
-        return open("/dev/full", mode)
-
-    path = tmp_path / "s.json.gz"
-    write_results([], {}, path)
-    before = path.read_bytes()
-    monkeypatch.setattr(Path, "open", full)
-    with pytest.raises(InputError, match="the disk is full"):
-        write_results([], {"commit": "newer"}, path)
-    monkeypatch.undo()
-    assert (path.read_bytes(), os.listdir(tmp_path)) == (before, [path.name])

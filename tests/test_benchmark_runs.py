@@ -283,12 +283,6 @@ def test_an_address_where_nobody_answers_says_what_to_do():
             connect(address, 0.5)
 
 
-def test_a_cluster_takes_no_number_of_jobs(tmp_path, capsys):
-    command = ["benchmark", "--suite", "smoke", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2"]
-    assert run_command(*command, "--out", tmp_path / "out") == 1
-    assert "--jobs: cannot be combined with --scheduler" in capsys.readouterr().err
-
-
 def test_a_scene_folder_must_be_the_same_on_the_worker(scene_file, tmp_path):
     folder = Path(shutil.copytree(scene_file.parent, tmp_path / "two"))
     episode = Episode(str(folder), content=content_of(str(folder)), settings=QUICK, views=1)

@@ -101,13 +101,6 @@ def test_a_pose_is_not_to_blame_for_a_change_that_is_noticed(state, caplog):
     assert caplog.text == ""
 
 
-def test_a_world_that_stays_has_no_history(state):
-    scene = Scene()
-    for view in views_of(state, np.arange(0.0, 360.0, 60.0), "carmine"):
-        scene.update(view)
-    assert scene.changes == ()
-
-
 def test_an_object_without_readings_is_not_gone(scene, state):
     (view,) = views_of(state, [50.0])
     scene.update(replace(view, depth=np.where(view.labels == 5, 0.0, view.depth).astype(np.float32)))

@@ -101,27 +101,6 @@ def test_a_front_alone_is_taken_to_be_as_deep_as_wide_within_free_space():
     assert bounded.shape.extents[0] == pytest.approx(0.045, abs=1.5 * VoxelConfig().size)
 
 
-def test_among_many_objects_it_reaches_down_to_the_first_one_in_its_way():
-    reached_table = 0
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        plate = box((0.0, 0.0, TABLE_TOP + 0.3), (0.1, 0.12, 0.03), turn_deg=20.0)
-        places = zip(*rng.uniform(-0.3, 0.3, (2, 10)), rng.uniform(0.05, 0.25, 10), strict=True)
-        pillars = [cylinder((x, y, TABLE_TOP + height / 2.0), 0.03, height) for x, y, height in places]
-        crowd = [thing(k, pillar) for k, pillar in enumerate(pillars, 2)]
-        done = completed(thing(1, plate, seen=SIDES_AND_TOP), *crowd)[0].shape
-        ticks = np.linspace(-0.5, 0.5, 21)
-        face = np.stack(np.meshgrid(ticks, ticks, [-0.5]), axis=-1).reshape(-1, 3) * done.extents
-        face = transforms.transform(done.T_world_object, face)
-        gap = min(o.shape.signed_distance(face).min() for o in crowd)
-        assert gap > -CONFIG.overlap - 0.001
-        if lowest(done) < TABLE_TOP + 1e-9:
-            reached_table += 1
-        else:
-            assert gap < CONFIG.overlap + 0.001
-    assert 2 <= reached_table <= 10
-
-
 def test_a_neighbour_that_overlaps_its_wall_does_not_stop_a_lower_side():
     """Both walls' positions are uncertain; the wall beside it holds nothing up."""
     hovering = thing(1, box((0.1, 0.0, TABLE_TOP + 0.06), (0.06, 0.08, 0.04)), seen=SIDES_AND_TOP)

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from synthetic import random_motion
 
-from caryatid.geometry import transforms
 from caryatid.io.video import SECOND, TransformTree
 
 NOW = 1_700_000_000 * SECOND
@@ -22,46 +19,6 @@ def tree_with(*links, gap=1.0):
         numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
         tree.add(parent, child, time, numbers, fixed=bool(fixed))
     return tree
-
-
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
-def test_chains_up_and_down_the_tree_multiply(seed):
-    rng = np.random.default_rng(seed)
-    A, B, C, D = (random_motion(rng) for _ in range(4))
-    links = ("map", "odom", NOW, A), ("odom", "base", NOW, B), ("odom", "hand", NOW, D)
-    tree = tree_with(*links, ("base", "eye", 0, C, True))
-    assert np.allclose(tree.between("map", "eye", NOW), A @ B @ C)
-    assert np.allclose(tree.between("eye", "map", NOW), np.linalg.inv(A @ B @ C))
-    assert np.allclose(tree.between("hand", "eye", NOW), np.linalg.inv(D) @ B @ C)
-    assert np.allclose(tree.between("odom", "odom", NOW), np.eye(4))
-
-
-@given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0))
-@settings(max_examples=30, deadline=None)
-def test_between_two_poses_the_path_is_straight_and_the_turn_even(seed, share):
-    rng = np.random.default_rng(seed)
-    start = random_motion(rng)
-    axis, angle, way = transforms.unit(rng.normal(size=3)), rng.uniform(0.0, 3.0), rng.normal(size=3)
-
-    def after(part):
-        R = start[:3, :3] @ transforms.rotation_from_vector(part * angle * axis)
-        return transforms.rigid(R, start[:3, 3] + part * way)
-
-    tree = tree_with(("map", "eye", NOW, start), ("map", "eye", NOW + SECOND // 2, after(1.0)))
-    nanoseconds = round(share * (SECOND // 2))
-    exact = after(nanoseconds / (SECOND // 2))
-    assert np.allclose(tree.between("map", "eye", NOW + nanoseconds), exact, atol=1e-7)
-
-
-def test_poses_may_come_in_any_order_and_the_last_of_a_time_counts():
-    rng = np.random.default_rng(0)
-    first, last, other = (random_motion(rng) for _ in range(3))
-    tree = tree_with(
-        ("map", "eye", NOW + SECOND, last), ("map", "eye", NOW, other), ("map", "eye", NOW, first)
-    )
-    assert np.allclose(tree.between("map", "eye", NOW), first)
-    assert np.allclose(tree.between("map", "eye", NOW + SECOND), last)
 
 
 @pytest.mark.parametrize("late", [-1, SECOND + 1, 3 * SECOND])

@@ -369,16 +369,6 @@ def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views,
     assert np.allclose(before, after, atol=1e-5)
 
 
-def test_opengl_axes_are_named_before_they_are_levelled(tmp_path, views, unfit):
-    flipped = [replace(view, T_world_camera=view.pose @ np.diag([1.0, -1.0, -1.0, 1.0])) for view in views]
-    options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
-    unfit(
-        tum_folder(tmp_path, flipped),
-        *options,
-        says="look away from what they show: the camera axes are OpenGL's",
-    )
-
-
 def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, unfit):
     turned = []
     for n, view in enumerate(views):
@@ -400,17 +390,6 @@ def test_of_too_many_views_those_farthest_apart_stay():
     along = poses([*np.linspace(0.0, 2.0, 11), 10.0, 20.0])
     chosen = choose_views(np.arange(13) * 1.0, np.ones(13), along, RecordingConfig(max_views=3))
     assert chosen == ([0, 11, 12], {"more than max_views": 10})
-
-
-def test_of_frames_from_one_place_the_sharpest_is_chosen_and_blurred_ones_never():
-    sharpness = np.where(np.arange(10) == 6, 1.2, 1.0)
-    chosen = choose_views(np.arange(10) / 30.0, sharpness, poses(np.zeros(10)), RecordingConfig())
-    assert chosen == ([6], {"same viewpoint as another view": 9})
-    times, sharpness = np.arange(40) * 0.1, np.where(np.arange(40) % 3 == 0, 10.0, 5.0)
-    kept, others = choose_views(times, sharpness, poses(times), RecordingConfig())
-    assert len(kept) > 8
-    assert all(k % 3 == 0 for k in kept)
-    assert others["blurred"] == 26
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 12))

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from dataclasses import replace
-from threading import Event
 
 import mujoco
 import numpy as np
@@ -21,7 +19,6 @@ from caryatid.exploration import Explorer
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Uncertainty
 from caryatid.graph import Grasp, Support, SupportGraph, TakeStep
-from caryatid.io import graph_from_json, graph_text
 from caryatid.manipulation.clearing import clear
 from caryatid.manipulation.dismantling import SimulatedHands, bodies_of
 from caryatid.manipulation.grasps import Blocked, find_grasp, gripper_boxes
@@ -105,31 +102,6 @@ class TestOrder:
         assert plan_order(tower(), CONFIG, seed=3, threads=2) == order
         assert order.steps[-1].why == "disturbed nothing in 2 rehearsals"
         assert order.risk == pytest.approx(1 / 6), "the same two scenes show all lifts"
-
-    def test_ids_may_be_any_texts(self):
-        text, names = graph_text(tower()), {"o1": "", "o2": "table", "o3": "world", "o4": "~"}
-        for old, new in names.items():
-            text = text.replace(f'"{old}"', f'"{new}"')
-        named = plan_order(graph_from_json(json.loads(text), "graph.json"), CONFIG)
-        known = plan_order(tower(), CONFIG)
-        assert [s.object_id for s in named.steps] == [names[s.object_id] for s in known.steps]
-
-    def test_an_interrupt_does_not_wait_for_running_rehearsals(self, monkeypatch):
-        begun, gate = Event(), Event()
-
-        def draw(rehearsal, group, number):
-            if number == 0:
-                begun.wait(20.0)
-                raise KeyboardInterrupt
-            begun.set()
-            gate.wait(20.0)
-
-        monkeypatch.setattr("caryatid.manipulation.order._Rehearsal._draw", draw)
-        began = time.monotonic()
-        with pytest.raises(KeyboardInterrupt):
-            plan_order(tower(), CONFIG, threads=2)
-        gate.set()
-        assert time.monotonic() - began < 10.0
 
     def test_to_get_at_one_object_only_what_is_in_the_way_is_taken(self):
         assert [s.object_id for s in plan_order(tower(), CONFIG, goal="o2").steps] == ["o3", "o2"]

@@ -14,7 +14,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import shapely
 from conftest import SMALL as SMALL_SENSOR
 from conftest import run_command
 from PIL import Image
@@ -34,7 +33,6 @@ from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.viz.colours import object_colour, rgb
 from caryatid.viz.drawings import (
-    Projection,
     draw_chart,
     draw_cloud,
     draw_image,
@@ -42,7 +40,7 @@ from caryatid.viz.drawings import (
 )
 from caryatid.viz.graph_drawing import arrange, draw_graph, layers
 from caryatid.viz.pdf import print_pdf
-from caryatid.viz.pictures import Tag, draw_tags, picture_svg
+from caryatid.viz.pictures import picture_svg
 from caryatid.viz.report import Figure, Report, make_report, render_html
 from caryatid.viz.scene_3d import scene_3d_html
 
@@ -354,36 +352,6 @@ def test_edges_point_upwards_and_vertices_keep_apart():
         for k, (x, level) in enumerate(places):
             assert x >= 0.0
             assert all(level != row or abs(x - other) >= 1.0 - 1e-9 for other, row in places[:k])
-
-
-def test_projection_agrees_with_the_view_and_knows_what_is_hidden(views):
-    view = views[0]
-    projection = Projection(view.pose, view.K, view.depth)
-    points_world = transforms.transform(view.pose, view.points_camera.reshape(-1, 3))[view.valid.ravel()]
-    found, z = projection.project(points_world)
-    assert np.allclose(found, np.argwhere(view.valid)[:, ::-1], atol=1e-6)
-    assert np.allclose(z, view.depth[view.valid], atol=1e-6)
-    assert not projection.hidden(found, z).any()
-    assert projection.hidden(found, z + 0.03).all()
-
-
-def test_names_keep_apart_shrink_in_a_crowd_and_are_left_out_where_they_could_not_be_read():
-    sizes = []
-    for count in (14, 60, 400):
-        places = np.random.default_rng(0).uniform(0.0, (400.0, 300.0), (count, 2))
-        tags = [Tag(x, y, f"o{k}", "#0072b2") for k, (x, y) in enumerate(places.tolist())]
-        parts = [part for group in draw_tags(tags, 400.0, 300.0, 15.0) for part in group]
-        plates = [
-            shapely.box(x, y, x + wide, y + high)
-            for part in parts if part.tag == "rect"
-            for x, y, wide, high in [[float(part.get(name)) for name in ("x", "y", "width", "height")]]
-        ]  # fmt: skip
-        assert len(plates) in (0, count)
-        if count == 14:
-            assert shapely.union_all(plates).area == pytest.approx(sum(plate.area for plate in plates))
-            assert shapely.box(0.0, 0.0, 400.0, 300.0).covers(shapely.union_all(plates))
-        sizes += {float(part.get("font-size")) for part in parts if part.tag == "text"} or {0.0}
-    assert sizes[0] == 15.0 > sizes[1] >= 6.0 > sizes[2] == 0.0
 
 
 # The command

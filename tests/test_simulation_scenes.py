@@ -32,7 +32,6 @@ NEEDS_SHARED = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared is abse
 
 TABLE = '<body name="table"><geom name="top" type="box" size="0.3 0.45 0.02" pos="0 0 0.73"/></body>'
 CUBE = '<body name="cube" pos="0 0 0.78"><freejoint/><geom type="box" size="0.03 0.02 0.03"/></body>'
-EASY = {"vertices": ["table", "a"], "edges": [{"supporter": "table", "supported": "a"}]}
 INTENDED = {
     "tower": {("table", 0), (0, 1), (1, 2), (2, 3), ("table", 4)},
     "bridge": {("table", 0), ("table", 1), ("table", 4), (0, 2), (1, 2), (2, 3)},
@@ -130,18 +129,6 @@ def test_volumes_of_shapes_in_their_bounds(geom: str, volume: float):
     assert (distance(points + (high - low) * [1.0, 0.0, 0.0]) > 0.0).all()
 
 
-@pytest.mark.parametrize(
-    ("size", "turn", "middle"),
-    [
-        ("0.02 0.45 0.3", "0 90 0", [0.0, 0.0, 0.75]),
-        ("0.3 0.45 0.02", "5 0 0", [0.0, -0.02 * np.sin(np.pi / 36.0), 0.73 + 0.02 * np.cos(np.pi / 36.0)]),
-    ],
-)
-def test_the_middle_of_a_table_that_is_turned_is_in_its_upper_face(size, turn, middle):
-    scene = scene_of(TABLE.replace('size="0.3 0.45 0.02"', f'size="{size}" euler="{turn}"') + CUBE)
-    np.testing.assert_allclose(table_centre(scene), middle, atol=1e-9)
-
-
 # Built-in and generated scenes
 
 
@@ -182,7 +169,7 @@ def test_piles_are_settled_and_of_the_size(size: int, seed: int):
     assert sum(supporter != "table" for supporter, _, _ in edges_of(scene)) >= size // 3
 
 
-@pytest.mark.parametrize(("size", "seed"), [(10, 0), pytest.param(25, 2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("size", "seed"), [(10, 0), (14, 2)])
 def test_dense_scenes_have_screens_a_heap_and_walls(size: int, seed: int):
     scene = generate("dense", size, seed)
     shapes = true_shapes(scene).values()
