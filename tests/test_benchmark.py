@@ -23,7 +23,7 @@ from caryatid.benchmark.episodes import (
     run_episode,
     settings_of,
 )
-from caryatid.benchmark.report import read_results, summarise_store, write_document, write_results
+from caryatid.benchmark.report import summarise_store
 from caryatid.benchmark.statistics import bootstrap, summarise
 from caryatid.benchmark.store import RESULTS, Member, ResultStore, collect_provenance
 from caryatid.benchmark.suites import SUITES, change_suite
@@ -342,18 +342,3 @@ def test_the_command_writes_tables_figures_and_pages_of_finished_episodes(tmp_pa
     assert parquet["f1"].dropna().tolist() == known
     assert run_command("benchmark", "--out", out, "--reference", "nobody") == 1
     assert "unknown method; choose one of support, random, oracle" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_a_document_can_be_made_again_of_the_summary(tmp_path):
-    fill(tmp_path / RESULTS, ("support", "random"), scenes=1)
-    with ResultStore(tmp_path / RESULTS) as store:
-        results, about = summarise_store(store), store.about
-    write_results(results, about, tmp_path / "s.json.gz")
-    for name, made in (("a", (results, about)), ("b", read_results(tmp_path / "s.json.gz"))):
-        (tmp_path / name).mkdir()
-        write_document(*made, tmp_path / name / "page.md", "command")
-    one, other = (sorted((tmp_path / name).rglob("*.*")) for name in "ab")
-    assert [file.name for file in one] == [file.name for file in other]
-    assert one[-1].read_text() == other[-1].read_text() != ""
-    assert len(one) > 3

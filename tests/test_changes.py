@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import ndimage
 from synthetic import (
     box,
     config_for,
@@ -149,19 +148,6 @@ def test_an_object_that_the_newest_view_did_not_show_can_be_moved_and_then_taken
         scene.update(view)
     assert kinds(scene) == [("moved", "o5"), ("removed", "o5")]
     assert "o5" not in vertices(scene.graph)
-
-
-@pytest.mark.parametrize("method", ["sg", "pc+sg"])
-def test_what_somebody_moved_out_of_sight_is_in_one_place(method, state):
-    """The view that shows the ball in its new place does not show the old one."""
-    scene = model_of(views_of(state, [0.0, 120.0, 240.0]), config_for(method))
-    before = scene.graph["o5"]
-    state[4, 1] += 0.12
-    (view,) = views_of(state, [50.0])
-    own = ndimage.binary_dilation(view.labels == 5, iterations=2)
-    scene.update(replace(view, depth=np.where(own | (view.labels == 0), view.depth, 0.0).astype(np.float32)))
-    np.testing.assert_allclose(scene.graph["o5"].centre_world - before.centre_world, (0, 0.12, 0), atol=0.01)
-    np.testing.assert_allclose(scene.graph["o5"].shape.extents, before.shape.extents, atol=0.01)
 
 
 def test_what_the_robot_puts_down_has_the_number_of_its_masks_and_no_colour(state):

@@ -46,7 +46,8 @@ STAYS = {"serve", "view"}
 SHORT = {
     "explore": (*SMALL, "--views=2", "--no-report"),
     "demo": (*SMALL, "--views=2", "--no-report"),
-    "clear": (*SMALL, "--no-report"),
+    "clear": (*SMALL, "--no-report", "--set=rehearsal.draws=2", "--risk=0.2", "--set=lift.watch=1.0"),
+    "order": ("--set=rehearsal.draws=2", "--risk=0.2"),
     "extract": ("--no-report",),
 }
 """Few pixels, few views and no report make commands quick here."""

@@ -17,7 +17,6 @@ from bag_files import (
     SECOND,
     START,
     WORLD,
-    BagFile,
     compressed_depth,
     jpeg,
     write_bag,
@@ -27,7 +26,6 @@ from conftest import run_command
 from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
-from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 from caryatid.config import Config, RecordingConfig
@@ -101,23 +99,6 @@ def test_without_a_world_a_single_frame_without_a_pose_is_taken(tmp_path, views,
 # Encodings
 
 
-def plain_bag(tmp_path, views, depth=None, colour=None, **camera):
-    """A bag with transforms as ROS 1 sent them before tf2; images are made by functions of bag and time."""
-    with BagFile(tmp_path / "one.bag") as bag:
-        layout = "geometry_msgs/TransformStamped[] transforms"
-        bag.store.register(get_types_from_msg(layout, "tf/msg/tfMessage"))
-        for index, view in enumerate(views):
-            time = START + index * SECOND
-            bag.write(INFO, bag.camera(time, **{"K": view.K, "size": (160, 120)} | camera), time)
-            millimetres = np.rint(view.depth * 1000.0).astype(np.uint16)
-            bag.write(DEPTH, depth(bag, time) if depth else bag.image(time, millimetres, "16UC1"), time)
-            if colour:
-                bag.write(RGB, colour(bag, time), time)
-            pose = bag.transform(time, "/" + WORLD, "/" + LENS, view.T_world_camera)
-            bag.write("/tf", bag.type("tf/msg/tfMessage")(transforms=pose.transforms), time)
-    return tmp_path / "one.bag"
-
-
 @pytest.mark.parametrize(
     ("encoding", "big", "padding"),
     [("16UC1", False, 0), ("mono16", True, 6), ("32FC1", False, 8), ("32FC1", True, 0)],
@@ -129,7 +110,9 @@ def test_raw_depth_omits_invalid_readings(tmp_path, views, encoding, big, paddin
     else:
         pixels[:8] = 0.0
         pixels = np.rint(pixels * 1000.0).astype(np.uint16)
-    bag = plain_bag(tmp_path, views[:1], lambda b, t: b.image(t, pixels, encoding, padding=padding, big=big))
+    bag = bag_of(
+        tmp_path, views[:1], depth=lambda b, t: b.image(t, pixels, encoding, padding=padding, big=big)
+    )
     (view,) = imported(tmp_path, bag, *TOPICS)
     assert not view.depth[:8].any()
     metres = views[0].depth if encoding == "32FC1" else pixels * 0.001
@@ -144,7 +127,7 @@ def test_compressed_depth(tmp_path, views, form, atol):
     depth = views[0].depth
     millimetres = np.rint(depth * 1000.0).astype(np.uint16)
     data = compressed_depth(depth, form[:5]) if "compressedDepth" in form else png(millimetres)
-    bag = plain_bag(tmp_path, views[:1], lambda b, t: b.compressed(t, data, form))
+    bag = bag_of(tmp_path, views[:1], depth=lambda b, t: b.compressed(t, data, form))
     (view,) = imported(tmp_path, bag, *TOPICS)
     assert ((view.depth > 0.0) == (depth > 0.0)).all()
     assert np.allclose(view.depth, depth, atol=atol)
@@ -174,12 +157,12 @@ def test_colour(tmp_path, views, pack, encoding):
             return bag.compressed(time, packed, encoding)
         return bag.image(time, np.ascontiguousarray(packed), encoding, padding=5)
 
-    (view,) = imported(tmp_path, plain_bag(tmp_path, views[:1], colour=message), *TOPICS, "--rgb", RGB)
+    (view,) = imported(tmp_path, bag_of(tmp_path, views[:1], colour=message), *TOPICS, "--rgb", RGB)
     assert np.abs(view.rgb.astype(int) - rgb).mean() < (3.0 if encoding == "jpeg" else 1e-9)
 
 
 def test_lens_distortion_is_reported(tmp_path, views, capsys):
-    imported(tmp_path, plain_bag(tmp_path, views[:1], D=(0.1, 0.0, 0.0, 0.0, 0.0)), *TOPICS)
+    imported(tmp_path, bag_of(tmp_path, views[:1], D=(0.1, 0.0, 0.0, 0.0, 0.0)), *TOPICS)
     assert "the lens has distortion" in capsys.readouterr().err
 
 
@@ -268,7 +251,7 @@ def colour_of(columns, frame):
 )
 def test_images_and_cameras_that_do_not_fit_or_cannot_be_decoded(tmp_path, views, unfit, odd, said):
     colour = ("--rgb", RGB) if "colour" in odd else ()
-    unfit(plain_bag(tmp_path, views[:1], **odd), *TOPICS, *colour, says=said)
+    unfit(bag_of(tmp_path, views[:1], **odd), *TOPICS, *colour, says=said)
 
 
 @EACH_KIND
@@ -384,12 +367,6 @@ def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views,
 def poses(positions):
     """Cameras along a line [m]."""
     return np.stack([transforms.rigid(np.eye(3), (x, 0.0, 0.0)) for x in positions])
-
-
-def test_of_too_many_views_those_farthest_apart_stay():
-    along = poses([*np.linspace(0.0, 2.0, 11), 10.0, 20.0])
-    chosen = choose_views(np.arange(13) * 1.0, np.ones(13), along, RecordingConfig(max_views=3))
-    assert chosen == ([0, 11, 12], {"more than max_views": 10})
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 12))

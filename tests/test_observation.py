@@ -42,16 +42,6 @@ def test_nothing_is_an_error_that_names_it(pose):
             level_transform(cloud, CONFIG, rng)
 
 
-@pytest.mark.parametrize("rise", [1.0, -2.0])
-def test_a_view_in_which_the_table_is_not_seen_keeps_the_one_known(rise):
-    known = observation_of(VIEW).surface
-    T = VIEW.pose.copy()
-    T[2, 3] += rise
-    elsewhere = observation_of(replace(VIEW, T_world_camera=T, labels=None), "auto", known=known)
-    assert elsewhere.surface is known
-    assert rise > 0 or not elsewhere.labels.any()
-
-
 def test_a_cloud_in_its_sensors_frame_is_levelled():
     observation = observation_of(VIEW, "labels")
     T_camera_world = transforms.invert(VIEW.pose)

@@ -208,25 +208,3 @@ def test_a_support_surface_leans_by_at_most_ten_degrees(degrees, level):
     with nullcontext() if level else pytest.raises(PerceptionError, match="no support surface"):
         surface = model_of([plane], segmentation="auto").surface
         np.testing.assert_allclose(surface.normal_world, R[:, 2], atol=1e-6)
-
-
-@pytest.mark.parametrize("turned", [False, True], ids=["upright", "upside down"])
-def test_without_a_pose_table_and_objects_are_found(turned):
-    view = table_scene(from_the_side(distance=1.0), STACK, [BALL], sigma=0.001)
-    if turned:
-        view = replace(view, depth=view.depth[::-1, ::-1].copy(), labels=view.labels[::-1, ::-1].copy())
-    scene = model_of([replace(view, T_world_camera=None)], segmentation="auto")
-    labels = np.where(scene.labels == SUPPORT_LABEL, 0, scene.labels)
-    assert found(labels, view.labels) == (3, 3, 3)
-    assert scene.T_world_camera[2, 3] == pytest.approx(view.pose[2, 3] - TABLE, abs=0.01)
-
-
-def test_masks_that_are_too_wide_label_nothing_far_behind_their_objects():
-    """Three pixels around the tower the masks show the floor, 75 cm below the small table."""
-    view = table_scene(from_the_side(elevation=20.0), STACK, half_table=(0.12, 0.25))
-    wide = replace(view, labels=ndimage.grey_dilation(view.labels, size=7))
-    assert (wide.labels > 0).sum() > 1.05 * (view.labels > 0).sum()
-    cloud = model_of([wide]).cloud
-    shown = cloud.points_world[np.isin(cloud.labels, (1, 2))]
-    assert len(shown) > 500
-    assert shown[:, 2].min() > TABLE - 0.05

@@ -107,27 +107,6 @@ class TestContacts:
         assert [(c.a, c.b) for c in find_contacts([cube(0, 0, 0), near], margin)] == [(0, 1)]
         assert find_contacts([cube(0, 0, 0), far], margin) == []
 
-    @pytest.mark.parametrize(
-        ("upper", "lower"),
-        [
-            (cube(0, 0, 0.1), cube(0, 0, 0)),
-            (Cylinder(at(0, 0, 0.1), 0.03, 0.1), cube(0, 0, 0)),
-            (Sphere(at(0, 0, 0.08), 0.03), Cylinder(at(0, 0, 0), 0.04, 0.1)),
-            (Cylinder(at(0, 0, 0.1), 0.03, 0.1), Cylinder(at(0, 0, 0), 0.04, 0.1)),
-            (Sphere(at(0, 0, 0.08), 0.03), Sphere(at(0, 0, 0), 0.05)),
-        ],
-    )
-    def test_every_pair_of_kinds_touches_with_the_normal_from_a_to_b(self, upper, lower):
-        for gap in (0.004, -0.004):
-            lifted = upper.moved(at(0, 0, gap))
-            (up,) = find_contacts([lower, lifted], 0.01)
-            (down,) = find_contacts([lifted, lower], 0.01)
-            np.testing.assert_allclose(up.normal_world, (0, 0, 1), atol=1e-3)
-            np.testing.assert_allclose(down.normal_world, (0, 0, -1), atol=1e-3)
-            assert up.distance == pytest.approx(gap, abs=1e-4)
-            np.testing.assert_allclose(up.points_world[:, 2].mean(), 0.05 + gap / 2.0, atol=1e-3)
-            np.testing.assert_allclose(up.point_world, up.points_world.mean(axis=0), atol=1e-12)
-
     def test_distances_agree_with_the_signed_distance_whatever_was_asked_before(self):
         rng = np.random.default_rng(3)
         seen = 0
@@ -153,12 +132,6 @@ class TestContacts:
         alone = [gaps(shapes) for shapes in scenes]
         with ThreadPoolExecutor(4) as pool:
             assert list(pool.map(gaps, scenes)) == alone
-
-    def test_few_shapes_and_bad_margins(self):
-        assert find_contacts([], 0.01) == find_contacts([cube(0, 0, 0)], 0.01) == []
-        for bad in (-0.001, float("nan")):
-            with pytest.raises(InputError, match="margin"):
-                find_contacts([cube(0, 0, 0), cube(0, 0, 0.1)], bad)
 
 
 def let_down(right):
@@ -255,8 +228,6 @@ class TestInfer:
         np.testing.assert_allclose(graph.support("o1", "o2").contact_world, (0.01, 0.0, 0.08), atol=2e-3)
         assert infer(falling_plank(), CONFIG).stability["o1"].tips
         assert edges(infer(leaning_plank(0.008), CONFIG))["o2", "o1"] == "lean"
-        with pytest.raises(InputError, match="same id"):
-            infer([*tower(), tower()[1]], CONFIG)
 
     def test_a_counterweight_holds_top_down(self):
         graph = infer(counterweight(), replace(CONFIG, draws=60))
@@ -312,9 +283,7 @@ class TestInfer:
                 ("o4", "o5"),
                 "o5 rests without it (gap 1.0 mm, normal 90° from the vertical). Probability 0.00.",
             ),
-            (STEADY, ("o2", "o3"), "o3 rests without it (gap 9.0 mm"),
             (leaning_plank(), ("o2", "o1"), "o1 leans on o2 with"),
-            (HELD["in the air"][0], ("o0", "o1"), "they do not touch, gap 370.0 mm"),
             (HELD["sunk in the table"][0], ("o1", "o0"), "nothing supports it"),
         ],
     )
@@ -327,9 +296,23 @@ class TestInfer:
     def test_why_on_paper_and_of_whom_it_cannot_be_asked(self):
         graph = infer(tower(), PAPER)
         assert explain(graph, "o2", "o1", PAPER).startswith("o2 does not support o1: o2 is not")
-        for pair, said in ((("o1", "o9"), "not an object of the graph"), (("o1", "o1"), "itself")):
-            with pytest.raises(InputError, match=said):
-                explain(graph, *pair, CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (lambda graph: explain(graph, "o1", "o9", CONFIG), "not an object of the graph"),
+        (lambda graph: explain(graph, "o1", "o1", CONFIG), "itself"),
+        (lambda graph: predict_removal(graph, "o9", CONFIG), "not an object of the graph"),
+        (lambda graph: predict_removal(graph, "o0", CONFIG), "support surface"),
+        (lambda graph: infer([*tower(), tower()[1]], CONFIG), "same id"),
+        (lambda graph: find_contacts([cube(0, 0, 0), cube(0, 0, 0.1)], -0.001), "margin"),
+        (lambda graph: find_contacts([cube(0, 0, 0), cube(0, 0, 0.1)], float("nan")), "margin"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(ask, said):
+    with pytest.raises(InputError, match=said):
+        ask(infer(tower(), CONFIG))
 
 
 class TestProbabilities:
@@ -427,13 +410,6 @@ class TestRemoval:
         earlier = Support("o4", "o3", probability=0.6)
         (effect,) = predict_removal(replace(graph, supports=(*graph.supports, earlier)), "o4", CONFIG)
         assert (effect.object_id, effect.probability) == ("o3", pytest.approx(0.6))
-
-    def test_unknown_objects_and_the_table_are_refused(self):
-        graph = infer(tower(), CONFIG)
-        with pytest.raises(InputError, match="not an object of the graph"):
-            predict_removal(graph, "o9", CONFIG)
-        with pytest.raises(InputError, match="support surface"):
-            predict_removal(graph, "o0", CONFIG)
 
 
 def thing(label, centre, known, size=(0.1, 0.1, 0.1)):
