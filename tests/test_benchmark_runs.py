@@ -30,7 +30,7 @@ from caryatid.runtime import fingerprint
 
 pytestmark = pytest.mark.slow
 
-SEEDS = 16
+SEEDS = 12
 COMMAND = ["benchmark", "--suite", "smoke", "--scenes", "tower", "--planner", "random", "--views", "2"]
 COMMAND += ["--jobs", "2", *SMALL]
 

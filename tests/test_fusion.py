@@ -145,6 +145,13 @@ def test_which_edges_each_method_keeps_found_in_views_true_and_not_in_views_fals
     assert (("o1", "o2") in edges(fused_of(*graphs, config=mild))) == any(found)
 
 
+def test_an_edge_is_certain_where_a_view_was_certain_of_it():
+    unsure = graph(("o0", "o1"), ("o1", "o2"), certain=False)
+    for views, certain in (((FULL, unsure), True), ((unsure, FULL), True), ((unsure, unsure), False)):
+        assert fused_of(*views).support("o1", "o2").certain == certain
+    assert not fused_of(FULL, unsure, config=BOTH).support("o1", "o2").certain
+
+
 @pytest.mark.parametrize("earlier", [0.95, 0.6])
 def test_a_view_that_denies_a_sure_support_is_less_sure_of_the_others(earlier):
     def said(*supports):

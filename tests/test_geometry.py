@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import mujoco
 import numpy as np
 import pytest
 import shapely
-from synthetic import random_motion, table_object, thing
+from synthetic import random_motion
 
-from caryatid.config import Config, SupportConfig
+from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.evaluation.scores import as_scene, score
 from caryatid.exports import export_graph
@@ -19,17 +16,14 @@ from caryatid.geometry import transforms
 from caryatid.geometry.polygons import area, cap, hull, intersection, signed_distance
 from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import (
-    KINDS,
     Box,
     Cylinder,
     Primitives,
-    Shape,
     Sphere,
     fibonacci_sphere,
 )
 from caryatid.geometry.solids import Polytope, Solid, hollowed
 from caryatid.graph import SceneObject, SupportGraph
-from caryatid.io.graph_json import graph_text, read_graph
 from caryatid.simulation.generation import generate
 from caryatid.simulation.truth import ground_truth
 from caryatid.simulation.world import true_shapes
@@ -163,50 +157,6 @@ def test_meshes_and_lines_lie_on_the_surface(shape):
     for points in (corners, lines):
         np.testing.assert_allclose(shape.signed_distance(points), 0.0, atol=1e-9)
     assert shape.mesh().volume == pytest.approx(shape.volume, rel=0.02)
-
-
-@pytest.fixture
-def prism():
-    """A kind of shape from outside the package: a straight hexagonal prism."""
-
-    @dataclass(frozen=True, eq=False, slots=True, repr=False)
-    class Prism(Shape):
-        T_world_object: np.ndarray
-        radius: float
-        height: float
-        kind: ClassVar[str] = "prism"
-
-        @property
-        def extents(self):
-            return np.array([2.0 * self.radius, np.sqrt(3.0) * self.radius, self.height])
-
-        @classmethod
-        def from_extents(cls, T_world_object, extents):
-            return cls(T_world_object, float(extents[0]) / 2.0, float(extents[2]))
-
-        def outline(self):
-            angle = np.pi / 3.0 * np.arange(6)
-            ring = self.radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(6)], axis=1)
-            end = np.array([0.0, 0.0, self.height / 2.0])
-            return transforms.transform(self.T_world_object, np.concatenate([ring + end, ring - end]))
-
-    yield Prism(transforms.rigid(np.eye(3), (0.0, 0.0, 0.81)), 0.05, 0.12)
-    del KINDS["prism"]
-
-
-def test_a_kind_of_shape_from_outside_works_in_files_exports_and_drawings(prism, tmp_path):
-    graph = infer([table_object(), thing(1, prism)], SupportConfig())
-    assert graph.support("o0", "o1") is not None
-    (tmp_path / "graph.json").write_text(graph_text(graph))
-    again = read_graph(tmp_path / "graph.json").objects[1].shape
-    assert type(again) is type(prism)
-    assert again.size == {"radius": 0.05, "height": 0.12}
-    assert prism.volume == pytest.approx(1.5 * np.sqrt(3.0) * 0.05**2 * 0.12)
-    assert "prism" in repr(prism).lower()
-    assert len(prism.lines(np.array([1.0, 1.0, 1.0]))) >= 18
-    for name in ("scene.glb", "scene.urdf"):
-        export_graph(graph, tmp_path / name)
-    assert "o1" in (tmp_path / "scene.urdf").read_text()
 
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

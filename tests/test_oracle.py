@@ -11,7 +11,7 @@ from conftest import SMALL, run_command
 from synthetic import FEW_VIEWS, simulated_scene
 
 from caryatid.config import OracleConfig
-from caryatid.evaluation.oracle import planner_for, spread_out
+from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
@@ -20,7 +20,7 @@ from caryatid.planning.planners import make_planner
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth
 
-CONFIG = replace(FEW_VIEWS, oracle=OracleConfig(candidates=8, stride=1))
+CONFIG = replace(FEW_VIEWS, oracle=OracleConfig(candidates=4, stride=1))
 
 
 class Chosen:
@@ -61,7 +61,7 @@ def test_what_it_predicts_is_what_comes_and_what_it_says(explored):
     assert len(steps) == 3
     assert [s.decision.saliency for s in steps[:-1]] == f1[1:]
     assert f1[1] > f1[0]
-    told = rf"F1 goes from {f1[0]:.2f} to {f1[1]:.2f}, the best of [89] views"
+    told = rf"F1 goes from {f1[0]:.2f} to {f1[1]:.2f}, the best of [45] views"
     assert re.match(told, steps[0].decision.why)
 
 
@@ -72,18 +72,6 @@ def test_trying_views_changes_nothing_of_the_exploration(explored):
     assert [graph_text(s.graph) for s in again] == [graph_text(s.graph) for s in steps]
     for one, other in zip(steps, again, strict=True):
         np.testing.assert_array_equal(one.view.depth, other.view.depth)
-
-
-@pytest.mark.slow
-def test_none_of_the_views_it_tries_would_have_been_better(explored):
-    steps, f1 = explored
-    config = replace(CONFIG, active=replace(CONFIG.active, max_views=2))
-    spread = spread_out(steps[0].candidates.directions, steps[0].visited, 8)
-    tried = {*spread.tolist(), exploration(make_planner("support"), config=config)[0][0].decision.index}
-    assert steps[0].decision.index in tried
-    others = [exploration(Chosen([index]), config=config)[1][1] for index in tried]
-    assert f1[1] == max(others)
-    assert min(others) < max(others)
 
 
 @pytest.mark.slow

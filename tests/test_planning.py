@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import re
-import subprocess
-import sys
 import tomllib
 from dataclasses import replace
 from functools import cache
@@ -15,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import SMALL
+from conftest import SMALL, run_command
 
 from caryatid.config import ActiveVisionConfig, RobotConfig, SupportConfig, VoxelConfig
 from caryatid.errors import InputError, PlanningError
@@ -59,7 +56,6 @@ def box(label, centre, extents, yaw=0.0):
 
 TABLE = box(0, (0.0, 0.0, 0.73), (0.7, 1.0, 0.04))
 CUBE = box(1, (0.0, 0.0, 0.80), (0.1, 0.1, 0.1))
-SCREEN = box(1, (0.0, 0.0, 0.9), (0.02, 0.6, 0.3))
 ON_TABLE = Support("o0", "o1")
 
 
@@ -230,16 +226,6 @@ def test_algorithm_2_as_printed_by_hand():
     assert np.sin(alpha[opposite] / 2.0) == pytest.approx(0.819, abs=0.01)
 
 
-def behind_screen(x, y, z):
-    return (x > 0.01) & (x < 0.3) & (np.abs(y) < 0.3) & (z > 0.75) & (z < 1.05)
-
-
-def beside_screen(**settings):
-    """What is behind a screen has not been seen."""
-    voxels = half_known(behind_screen, TABLE, SCREEN)
-    return replace(state([SCREEN], (ON_TABLE,), look_directions=150, **settings), voxels=voxels)
-
-
 RIDER, ASIDE = box(2, (0.0, 0.0, 0.88), (0.06, 0.06, 0.06)), box(3, (0.2, -0.35, 0.8), (0.1, 0.1, 0.1))
 
 
@@ -400,21 +386,6 @@ class TestVolumetric:
             first = states[: states.index(OCCUPIED) + 1]
             assert along(*first) == pytest.approx(along(*first, UNKNOWN, UNKNOWN, OCCUPIED))
 
-    @pytest.mark.parametrize("name", VOLUMETRIC)
-    def test_its_score_is_the_utility(self, name):
-        free, dear = (decide(name, beside_screen(path_cost=cost)) for cost in ("none", "angle"))
-        looks, spacing = OPEN.looks(150), np.sqrt(4.0 * np.pi / 150)
-        away = transforms.angle_between(HOME, OPEN.directions[looks.chosen])
-        new, angle = looks.chosen[away > spacing], away[away > spacing]
-        share = free.candidate_saliency[new]
-        assert free.saliency == share.max() == 1.0
-        assert name == "occlusion-aware" or OPEN.directions[free.index][0] > 0.3, "past the screen"
-        said = f"{1.0 / share.mean():.1f} times the mean {name} information of all views, 100% of the maximum"
-        assert free.why == said
-        utility = share / share.sum() - np.sin(angle / 2.0) / np.sin(angle / 2.0).sum()
-        assert dear.index == new[int(np.argmax(utility))]
-        assert dear.score == pytest.approx(utility.max() * share.sum())
-
 
 PACKAGE = Path(__file__).parents[1] / "examples" / "planner_package"
 PROJECT = tomllib.loads((PACKAGE / "pyproject.toml").read_text())["project"]
@@ -441,21 +412,16 @@ class TestAPlannerOfAnotherPackage:
             make_planner("best")
 
     @pytest.mark.slow
-    def test_the_command_line_explores_with_it(self, tmp_path):
+    def test_the_command_line_explores_with_it(self, tmp_path, monkeypatch):
         """The package is installed: its metadata is where and as pip writes it."""
         name, version = PROJECT["name"], PROJECT["version"]
         folder = tmp_path / f"site/{name.replace('-', '_')}-{version}.dist-info"
         folder.mkdir(parents=True)
         (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
         (folder / "entry_points.txt").write_text(f"[caryatid.planners]\n{NAME} = {VALUE}\n")
-        path = [str(tmp_path / "site"), str(PACKAGE / "src"), os.environ.get("PYTHONPATH", "")]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path)), "COLUMNS": "200"}
+        for path in (tmp_path / "site", PACKAGE / "src"):
+            monkeypatch.syspath_prepend(path)
         options = ["--planner", NAME, "--views", "2", "--no-report", "--quiet", *SMALL]
-        run = ["-m", "caryatid", "explore", "tower", "--out", str(tmp_path / "run"), *options]
-        command = [sys.executable, *map(str, run)]
-        done = subprocess.run(
-            command, env=environment, capture_output=True, text=True, timeout=300, check=False
-        )
-        assert done.returncode == 0, done.stderr
+        assert run_command("explore", "tower", "--out", tmp_path / "run", *options) == 0
         assert "from above" in (tmp_path / "run/views/00/view.json").read_text()
         assert f'"planner": "{NAME}"' in (tmp_path / "run/run.json").read_text()

@@ -210,6 +210,13 @@ def test_a_stray_reading_is_gone_after_three_views_through_it():
     assert states[3] == FREE
 
 
+def test_evidence_does_not_overflow():
+    empty = VoxelMap.around((0.0, 0.0, 0.0), VOXELS)
+    full = np.full_like(empty.hits, 255)
+    voxels = VoxelMap(empty.origin_world, full, full, VOXELS).integrate(wall_view(), 3.0)
+    assert voxels.hits.min() == voxels.passes.min() == 255
+
+
 def test_lines_of_sight_stop_at_what_is_solid_and_leave_the_clearance_out():
     box = Box(transforms.rigid(np.eye(3), (0.0, 0.0, 0.0)), np.array([0.1, 0.1, 0.1]))
     occluders = VoxelMap.around((0.0, 0.0, 0.0), VOXELS).occluders([box])

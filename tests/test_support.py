@@ -257,21 +257,6 @@ class TestInfer:
         assert support.doubtful
         assert support.kind == "bottom-up"
 
-    def test_what_could_carry_a_floating_board_shares_the_probability(self):
-        """A ball is nearest, two pillars are a little further below, and any of them may be hidden higher."""
-        pillars = [block(0, y, 0, (0.06, 0.06, 0.11)) for y in (-0.15, 0.15)]
-        ball, board = Sphere(at(0.01, 0.0, 0.085), 0.03), block(0, 0, 0.13, (0.16, 0.42, 0.02))
-        graph = infer(scene(*pillars, ball, board, uncertainty=unsure(0.002, 0.0)), replace(CONFIG, draws=60))
-        assert {s.supporter for s in graph.supporters("o4")} >= {"o1", "o2"}
-        assert all(s.doubtful for s in graph.supporters("o4"))
-
-    def test_what_touches_nothing_is_let_down_by_so_much_at_most(self):
-        objects = scene(block(0, 0, 0, (0.1, 0.1, 0.05)), block(0.02, 0, 0.08, (0.05, 0.05, 0.05)))
-        graph = infer(objects, CONFIG)
-        assert set(edges(graph)) == {("o0", "o1"), ("o1", "o2")}
-        assert graph.stability["o2"].overhang == pytest.approx(-0.025, abs=1e-3)
-        assert [s.pair for s in infer(objects, replace(CONFIG, max_drop=0.02)).supports] == [("o0", "o1")]
-
     @pytest.mark.parametrize(
         ("objects", "pair", "said"),
         [
