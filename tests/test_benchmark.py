@@ -71,13 +71,8 @@ def test_every_suite_is_made_of_valid_episodes_and_can_be_changed(name):
     suite = SUITES[name]
     assert all(is_builtin(scene) for scene in suite.scenes)
     few = replace(suite, scenes=suite.scenes[:1], seeds=1)
-    changed = change_suite(
-        few,
-        fusions=["pc", "sg"],
-        segmentations=["auto", "labels"],
-        noises=["none", "carmine"],
-        settings=["noise.translation=0.02"],
-    )
+    options = {"fusions": ["pc", "sg"], "segmentations": ["auto", "labels"], "noises": ["none", "carmine"]}
+    changed = change_suite(few, **options, settings=["noise.translation=0.02"])
     for one in (few, changed):
         members = one.members()
         assert len(members) == len(one.conditions) * len(one.methods)
@@ -93,10 +88,8 @@ def test_every_suite_is_made_of_valid_episodes_and_can_be_changed(name):
 def test_planners_replace_the_methods_and_options_are_not_settings():
     suite = replace(SUITES["smoke"], scenes=("tower",))
     changed = change_suite(suite, planners=["random", "paper", "random"])
-    assert [(m.method, m.episode.planner, m.episode.fusion) for m in changed.members()] == [
-        ("random", "random", "pc+sg"),
-        ("paper", "paper", "pc+sg"),
-    ]
+    said = [(m.method, m.episode.planner, m.episode.fusion) for m in changed.members()]
+    assert said == [("random", "random", "pc+sg"), ("paper", "paper", "pc+sg")]
     with pytest.raises(InputError, match=r"fusion\.method=pc: is set for each episode; use --fusion"):
         change_suite(suite, settings=["fusion.method=pc"])
 

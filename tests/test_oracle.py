@@ -11,7 +11,7 @@ from conftest import SMALL, run_command
 from synthetic import FEW_VIEWS, simulated_scene
 
 from caryatid.config import OracleConfig
-from caryatid.evaluation.oracle import planner_for
+from caryatid.evaluation.oracle import planner_for, spread_out
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
@@ -72,6 +72,18 @@ def test_trying_views_changes_nothing_of_the_exploration(explored):
     assert [graph_text(s.graph) for s in again] == [graph_text(s.graph) for s in steps]
     for one, other in zip(steps, again, strict=True):
         np.testing.assert_array_equal(one.view.depth, other.view.depth)
+
+
+@pytest.mark.slow
+def test_none_of_the_views_it_tries_would_have_been_better(explored):
+    steps, f1 = explored
+    config = replace(CONFIG, active=replace(CONFIG.active, max_views=2))
+    spread = spread_out(steps[0].candidates.directions, steps[0].visited, 4)
+    tried = {*spread.tolist(), exploration(make_planner("support"), config=config)[0][0].decision.index}
+    assert steps[0].decision.index in tried
+    others = [exploration(Chosen([index]), config=config)[1][1] for index in tried]
+    assert f1[1] == max(others)
+    assert min(others) < max(others)
 
 
 @pytest.mark.slow
