@@ -91,15 +91,6 @@ def test_what_somebody_put_down_is_new(segmentation, state):
     assert scene.graph[scene.changes[0].object_id].shape.kind == "sphere"
 
 
-def test_a_pose_is_not_to_blame_for_a_change_that_is_noticed(state, caplog):
-    without = state.copy()
-    without[1:4, 2] += 50.0
-    scene = model_of(views_of(without, [0.0, 120.0, 240.0]))
-    scene.update(*views_of(state, [200.0]))
-    assert kinds(scene) == [("added", f"o{k}") for k in (2, 3, 4)]
-    assert caplog.text == ""
-
-
 def test_an_object_without_readings_is_not_gone(scene, state):
     (view,) = views_of(state, [50.0])
     scene.update(replace(view, depth=np.where(view.labels == 5, 0.0, view.depth).astype(np.float32)))

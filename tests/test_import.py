@@ -27,12 +27,14 @@ from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from synthetic import random_motion
 
 from caryatid.config import Config, RecordingConfig
 from caryatid.geometry import transforms
 from caryatid.io import read_recording
 from caryatid.io.images import png
 from caryatid.io.importing import choose_views
+from caryatid.io.video import TransformTree
 from caryatid.sources import open_recording
 
 TOPICS = ("--depth", DEPTH, "--info", INFO)
@@ -390,3 +392,40 @@ def test_views_are_few_apart_and_every_frame_is_accounted_for(seed, count, most)
         assert all(
             m or t.magnitude() > np.radians(config.min_angle) for m, t in zip(moved, turns, strict=True)
         )
+
+
+# Frames over time
+
+
+def tree_with(*links, gap=1.0):
+    tree = TransformTree(gap)
+    for parent, child, time, pose, *fixed in links:
+        numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        tree.add(parent, child, time, numbers, fixed=bool(fixed))
+    return tree
+
+
+@pytest.mark.parametrize("late", [-1, SECOND + 1, 3 * SECOND])
+def test_no_pose_is_invented_outside_the_messages_or_across_a_gap(late):
+    rng = np.random.default_rng(1)
+    links = [("map", "eye", START + k * SECOND, random_motion(rng)) for k in (0, 1)]
+    assert tree_with(*links).between("map", "eye", START + late) is None
+    assert tree_with(*links, gap=1.0).between("map", "eye", START + SECOND // 2).shape == (4, 4)
+    assert tree_with(*links, gap=0.9).between("map", "eye", START + SECOND // 2) is None
+
+
+def test_a_frame_that_changes_its_parent_has_no_pose_in_between():
+    rng = np.random.default_rng(3)
+    tree = tree_with(
+        ("map", "cup", START, random_motion(rng)), ("hand", "cup", START + SECOND, random_motion(rng))
+    )
+    assert tree.between("map", "cup", START).shape == (4, 4)
+    for target in ("map", "hand"):
+        assert tree.between(target, "cup", START + 1) is None
+
+
+def test_frames_in_a_circle_and_frames_apart_are_refused():
+    tree = tree_with(("a", "b", START, np.eye(4)), ("b", "a", START, np.eye(4)), ("c", "d", START, np.eye(4)))
+    for target in ("c", "nowhere"):
+        assert tree.between(target, "a", START) is None
+    assert tree.frames == ["a", "b", "c", "d"]

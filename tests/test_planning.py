@@ -313,17 +313,6 @@ class TestBaselines:
         third = plan("ring", [CUBE], visited=visited[:2])
         assert third.why == "stop 3 of 5 around the scene, 144° from the first view"
 
-    def test_farthest_is_farthest_and_of_equal_ones_the_first(self):
-        visited = self.tour("farthest", 6)
-        for n in range(1, len(visited)):
-            smallest = max(transforms.angle_between(visited[:n], d).min() for d in OPEN.directions[::7])
-            assert transforms.angle_between(visited[:n], visited[n]).min() >= smallest - 1e-6
-        equal = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]])
-        offered = Candidates(np.tile(np.eye(4), (3, 1, 1)), equal, np.zeros(3), {})
-        decision = plan("farthest", [CUBE], visited=np.array([[-1.0, 0.0, 0.0]]), offered=offered)
-        assert decision.index == 0
-        assert decision.why == "farthest from earlier views: 90° from the nearest"
-
 
 SIZE, OF_FREE, OF_OCCUPIED = 0.01, 0.12, 0.97
 """Edge of a voxel [m]; occupancy of voxels of one reading's kind seen often enough for the clamp."""

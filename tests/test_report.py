@@ -38,7 +38,7 @@ from caryatid.viz.drawings import (
     draw_image,
     draw_sphere,
 )
-from caryatid.viz.graph_drawing import arrange, draw_graph, layers
+from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.pdf import print_pdf
 from caryatid.viz.pictures import picture_svg
 from caryatid.viz.report import Figure, Report, make_report, render_html
@@ -330,28 +330,6 @@ def test_the_cloud_is_drawn_in_the_objects_colours_at_their_places():
     assert (raster[..., 3] > 0).mean() > 0.2
     across = np.flatnonzero((raster[..., 3] > 0).any(axis=0))
     assert abs(across.mean() - raster.shape[1] / 2.0) < 0.05 * raster.shape[1]
-
-
-def chain(pairs: list[tuple[str, str]], count: int) -> SupportGraph:
-    shape = Sphere(np.eye(4), 0.05)
-    objects = [SceneObject(f"o{k}", k, shape, "object" if k else "support_surface") for k in range(count)]
-    return SupportGraph(tuple(objects), tuple(Support(a, b) for a, b in pairs))
-
-
-def test_edges_point_upwards_and_vertices_keep_apart():
-    assert layers(make_graph()) == {"o0": 0, "o1": 1, "o2": 2, "o7": 1}
-    rng = np.random.default_rng(3)
-    for _ in range(20):
-        count = int(rng.integers(2, 16))
-        pairs = {(f"o{rng.integers(0, k)}", f"o{k}") for k in range(1, count) for _ in range(2)}
-        position, route = arrange(chain(sorted(pairs), count))
-        for lower, upper in pairs:
-            assert position[lower][1] < position[upper][1]
-            assert (route[lower, upper][0], route[lower, upper][-1]) == (position[lower], position[upper])
-        places = [at for name, at in position.items() if name != "o0"]
-        for k, (x, level) in enumerate(places):
-            assert x >= 0.0
-            assert all(level != row or abs(x - other) >= 1.0 - 1e-9 for other, row in places[:k])
 
 
 # The command
