@@ -79,8 +79,10 @@ def test_too_few_points_are_a_clear_failure(count):
     result = fit(points[:count], normals[:count], config=CONFIG, rng=np.random.default_rng(0))
     assert isinstance(result, FitFailure)
     assert result.reason == f"{count} points are too few, a shape needs {CONFIG.min_points}"
-    points[count:] = np.nan
-    assert fit(points, normals, config=CONFIG, rng=np.random.default_rng(0)) == result
+    kept = np.ones_like(points)
+    kept[count:, 0] = np.nan
+    for p, n in ((kept * points, normals), (points, kept * normals)):
+        assert fit(p, n, config=CONFIG, rng=np.random.default_rng(0)) == result
     large = surface_points(box((0, 0, 0), (0.9, 0.8, 0.7)), np.random.default_rng(0), spacing=0.03)
     assert "0.5 m" in fit(*large, config=CONFIG, rng=np.random.default_rng(0)).reason
 
