@@ -151,6 +151,15 @@ def test_the_support_function_reaches_as_far_as_the_surface(shape):
 
 
 @each
+def test_gradients_point_away_from_the_surface(shape):
+    points, _ = around(shape, 200)
+    distances, outward = Primitives.of([shape]).gradient(0, points)
+    np.testing.assert_allclose(distances, shape.signed_distance(points), atol=1e-12)
+    steps = shape.signed_distance(points + 1e-7 * outward) - distances
+    np.testing.assert_allclose(steps, 1e-7, atol=1e-9)
+
+
+@each
 def test_meshes_and_lines_lie_on_the_surface(shape):
     corners = transforms.transform(shape.T_world_object, shape.mesh().vertices)
     lines = np.concatenate(shape.lines(np.array([1.0, 2.0, 3.0])))

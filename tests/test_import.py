@@ -354,13 +354,25 @@ def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views,
     assert np.allclose(before, after, atol=1e-5)
 
 
-def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, unfit):
-    turned = []
-    for n, view in enumerate(views):
-        T = transforms.rigid(transforms.rotation_from_vector((0.8 * n, 0.3 * n, 0.0)), (n, 0.0, 0.0))
-        turned.append(replace(view, T_world_camera=T @ view.pose))
-    options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
-    unfit(tum_folder(tmp_path, turned), *options, says="1 of 3 views agree on which way is up")
+def flipped(number, view):
+    return view.pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def turned(number, view):
+    R = transforms.rotation_from_vector((0.8 * number, 0.3 * number, 0.0))
+    return transforms.rigid(R, (number, 0.0, 0.0)) @ view.pose
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (flipped, "look away from what they show: the camera axes are OpenGL's"),
+        (turned, "1 of 3 views agree on which way is up"),
+    ],
+)
+def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, unfit, change, said):
+    folder = tum_folder(tmp_path, [v.with_pose(change(n, v)) for n, v in enumerate(views)])
+    unfit(folder, "--camera", camera_file(tmp_path, views[0].K), "--level", says=said)
 
 
 # Which frames become views
@@ -369,6 +381,12 @@ def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views,
 def poses(positions):
     """Cameras along a line [m]."""
     return np.stack([transforms.rigid(np.eye(3), (x, 0.0, 0.0)) for x in positions])
+
+
+def test_of_too_many_views_those_farthest_apart_stay():
+    along = poses([*np.linspace(0.0, 2.0, 11), 10.0, 20.0])
+    chosen = choose_views(np.arange(13) * 1.0, np.ones(13), along, RecordingConfig(max_views=3))
+    assert chosen == ([0, 11, 12], {"more than max_views": 10})
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 12))

@@ -423,6 +423,13 @@ class TestCommands:
         assert ("was not seen empty" if not taken else "o1 is removed") in document["stop"]
         assert {o.id for o in run.graph.objects} == {"o0", "o1", "o2"} - {i for i, _ in taken}
 
+    def test_it_keeps_looking_while_no_lift_is_safe(self, scene_file, tmp_path, capsys):
+        command = ["clear", scene_file, "--views", 3, "--set=active.effort=1", "--json", "--no-report"]
+        assert run_command(*command, "--out", tmp_path / "run", *SMALL, "--risk=0", QUICK[0], QUICK[2]) == 3
+        document = json.loads(capsys.readouterr().out)
+        assert (document["views"], document["steps"]) == (3, [])
+        assert document["stop"].startswith("no lift is safe")
+
     @pytest.mark.parametrize(
         ("name", "segmentation", "why", "views"),
         [("clear", "labels", "is not an object of the scene; known objects: o1, o2", None),

@@ -11,7 +11,8 @@ from conftest import SMALL, run_command
 from synthetic import FEW_VIEWS, simulated_scene
 
 from caryatid.config import OracleConfig
-from caryatid.evaluation.oracle import planner_for, spread_out
+from caryatid.errors import InputError
+from caryatid.evaluation.oracle import OraclePlanner, planner_for, spread_out
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
@@ -84,6 +85,16 @@ def test_none_of_the_views_it_tries_would_have_been_better(explored):
     others = [exploration(Chosen([index]), config=config)[1][1] for index in tried]
     assert f1[1] == max(others)
     assert min(others) < max(others)
+
+
+@pytest.mark.parametrize("wrong", ["camera", "seed"])
+def test_another_exploration_than_its_own_is_refused(wrong):
+    stage = make_simulation(simulated_scene("tower"), CONFIG, noise="carmine", seed=0)
+    oracle = OraclePlanner(stage.camera, truth_of("tower"), CONFIG, segmentation="labels")
+    camera, seed = (stage.camera, 0) if wrong == "camera" else (oracle.camera, 1)
+    steps = explore(camera, stage.robot, planner=oracle, config=CONFIG, segmentation="labels", seed=seed)
+    with pytest.raises(InputError, match="differ from those of this exploration; pass its camera"):
+        list(steps)
 
 
 @pytest.mark.slow

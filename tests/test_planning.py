@@ -171,6 +171,8 @@ class TestEveryPlanner:
         assert decision.why
         assert decision.score == pytest.approx(decision.saliency - decision.cost)
         assert f"candidate {decision.index}, score {decision.score:.3f}: {decision.why}" in repr(decision)
+        assert name != "occlusion-aware" or f"times the mean {name} information of all views" in decision.why
+        assert name != "farthest" or decision.why.startswith("farthest from earlier views: ")
         if name in ("random", "ring", "farthest"):
             assert decision.candidate_saliency is decision.sphere_saliency is None
             return

@@ -182,6 +182,10 @@ def cropped(view):
         (near, "10000 readings nearer than cloud.min_depth = 0.1 m are ignored"),
         (without_depth, "too few depth readings in mask 1; its object is missed"),
         (cropped, "the support surface has only 0.0"),
+        (
+            lambda view: replace(view, K=np.diag([2.0, 2.0, 1.0]) @ view.K, T_world_camera=None),
+            "is K for another resolution?",
+        ),
     ],
 )
 def test_what_a_view_lacks_is_said(change, says, caplog):

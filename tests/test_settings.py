@@ -93,6 +93,22 @@ def test_a_value_of_the_wrong_type_or_range_says_what_is_wanted(flag, wanted):
     assert wanted in caught.value.remedy
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("extract recording --masks . --segmentation auto", "--segmentation auto, which uses no masks"),
+        ("extract table.pcd --masks .", "masks need images, and a cloud has none"),
+        (
+            "benchmark --suite smoke --scheduler tcp://127.0.0.1:1 --jobs 2",
+            "cannot be combined with --scheduler",
+        ),
+    ],
+)
+def test_options_that_exclude_each_other_are_refused(words, said, tmp_path, capsys):
+    assert run_command(*words.split(), "--out", tmp_path / "run") == 1
+    assert said in capsys.readouterr().err
+
+
 def test_a_demo_starts_from_the_preset_and_flags_change_it(tmp_path):
     options = ("--preset", "paper", "--masks", "per-view", "--views", 1, "--no-report", "--quiet")
     assert run_command("demo", "--out", tmp_path / "run", *options, *SMALL) == 0
