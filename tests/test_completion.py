@@ -88,6 +88,16 @@ def test_what_sticks_in_the_table_is_cut_off_at_its_top():
     assert highest(done.shape) == pytest.approx(highest(sunk))
 
 
+@pytest.mark.parametrize(("tilt_deg", "extended"), [(15.0, True), (45.0, False)])
+def test_only_a_side_that_faces_down_is_one_to_rest_on(tilt_deg, extended):
+    R = transforms.rotation_from_vector((np.radians(tilt_deg), 0.0, 0.0))
+    tilted = cylinder((0.0, 0.0, 0.0), 0.02, 0.06).moved(transforms.rigid(R, (0.0, 0.0, TABLE_TOP + 0.1)))
+    (done,) = completed(thing(1, tilted, seen=SIDES_AND_TOP))
+    assert (done.shape.height > tilted.height) == extended
+    # The face is tested at points, not on all of its rim.
+    assert lowest(done.shape) >= TABLE_TOP - 0.001
+
+
 def test_a_front_alone_is_taken_to_be_as_deep_as_wide_within_free_space():
     front = box((0.0, 0.0, TABLE_TOP + 0.05), (0.01, 0.08, 0.1))
     flat = thing(1, front, seen=(True, False, False, False, False, False))
