@@ -116,8 +116,13 @@ T_BASE_LENS = transforms.rigid(transforms.rotation_from_vector((-1.2, 0.9, -0.4)
 """Where the camera sits on the robot."""
 
 
-def write_bag(path, views, storage="sqlite3", *, without_pose=(), without_colour=()):
-    """Write views as a robot would: depth in mm, colour, camera, poses of the base before and after."""
+def write_bag(
+    path, views, storage="sqlite3", *, without_pose=(), without_colour=(), depth=None, colour=None, **camera
+):
+    """Write views as a robot would: depth in mm, colour, camera, poses of the base before and after.
+
+    Other depth and colour images are made by functions of bag and time, another camera by fields of `camera`.
+    """
     with BagFile(path, storage) as bag:
         if not views:
             return
@@ -136,12 +141,12 @@ def write_bag(path, views, storage="sqlite3", *, without_pose=(), without_colour
                     T = transforms.rigid(T_world_base[:3, :3] @ R, T_world_base[:3, 3] + t)
                     when = time + late * SECOND // 1000
                     bag.write("/tf", bag.transform(when, WORLD, BASE, T), when)
-            bag.write(INFO, bag.camera(time, view.K, size), time)
-            depth = np.rint(view.depth * 1000.0).astype(np.uint16)
-            bag.write(DEPTH, bag.image(time, depth, "16UC1"), time + 1000)
+            bag.write(INFO, bag.camera(time, **{"K": view.K, "size": size} | camera), time)
+            units = np.rint(view.depth * 1000.0).astype(np.uint16)
+            bag.write(DEPTH, depth(bag, time) if depth else bag.image(time, units, "16UC1"), time + 1000)
             if index not in without_colour:
                 late = time + SECOND // 200
-                bag.write(RGB, bag.image(late, view.rgb, "rgb8"), late)
+                bag.write(RGB, colour(bag, late) if colour else bag.image(late, view.rgb, "rgb8"), late)
 
 
 def write_tum(folder, views):

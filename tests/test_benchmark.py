@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -25,7 +23,7 @@ from caryatid.benchmark.episodes import (
     run_episode,
     settings_of,
 )
-from caryatid.benchmark.report import read_results, summarise_store, write_document, write_results
+from caryatid.benchmark.report import summarise_store
 from caryatid.benchmark.statistics import bootstrap, summarise
 from caryatid.benchmark.store import RESULTS, Member, ResultStore, collect_provenance
 from caryatid.benchmark.suites import SUITES, change_suite
@@ -73,13 +71,8 @@ def test_every_suite_is_made_of_valid_episodes_and_can_be_changed(name):
     suite = SUITES[name]
     assert all(is_builtin(scene) for scene in suite.scenes)
     few = replace(suite, scenes=suite.scenes[:1], seeds=1)
-    changed = change_suite(
-        few,
-        fusions=["pc", "sg"],
-        segmentations=["auto", "labels"],
-        noises=["none", "carmine"],
-        settings=["noise.translation=0.02"],
-    )
+    options = {"fusions": ["pc", "sg"], "segmentations": ["auto", "labels"], "noises": ["none", "carmine"]}
+    changed = change_suite(few, **options, settings=["noise.translation=0.02"])
     for one in (few, changed):
         members = one.members()
         assert len(members) == len(one.conditions) * len(one.methods)
@@ -95,10 +88,8 @@ def test_every_suite_is_made_of_valid_episodes_and_can_be_changed(name):
 def test_planners_replace_the_methods_and_options_are_not_settings():
     suite = replace(SUITES["smoke"], scenes=("tower",))
     changed = change_suite(suite, planners=["random", "paper", "random"])
-    assert [(m.method, m.episode.planner, m.episode.fusion) for m in changed.members()] == [
-        ("random", "random", "pc+sg"),
-        ("paper", "paper", "pc+sg"),
-    ]
+    said = [(m.method, m.episode.planner, m.episode.fusion) for m in changed.members()]
+    assert said == [("random", "random", "pc+sg"), ("paper", "paper", "pc+sg")]
     with pytest.raises(InputError, match=r"fusion\.method=pc: is set for each episode; use --fusion"):
         change_suite(suite, settings=["fusion.method=pc"])
 
@@ -344,33 +335,3 @@ def test_the_command_writes_tables_figures_and_pages_of_finished_episodes(tmp_pa
     assert parquet["f1"].dropna().tolist() == known
     assert run_command("benchmark", "--out", out, "--reference", "nobody") == 1
     assert "unknown method; choose one of support, random, oracle" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_a_document_can_be_made_again_of_the_summary(tmp_path):
-    fill(tmp_path / RESULTS, ("support", "random"), scenes=1)
-    with ResultStore(tmp_path / RESULTS) as store:
-        results, about = summarise_store(store), store.about
-    write_results(results, about, tmp_path / "s.json.gz")
-    for name, made in (("a", (results, about)), ("b", read_results(tmp_path / "s.json.gz"))):
-        (tmp_path / name).mkdir()
-        write_document(*made, tmp_path / name / "page.md", "command")
-    one, other = (sorted((tmp_path / name).rglob("*.*")) for name in "ab")
-    assert [file.name for file in one] == [file.name for file in other]
-    assert one[-1].read_text() == other[-1].read_text() != ""
-    assert len(one) > 3
-
-
-def test_a_full_disk_keeps_the_older_results(tmp_path, monkeypatch):
-    def full(path, mode):
-        path.touch()
-        return open("/dev/full", mode)
-
-    path = tmp_path / "s.json.gz"
-    write_results([], {}, path)
-    before = path.read_bytes()
-    monkeypatch.setattr(Path, "open", full)
-    with pytest.raises(InputError, match="the disk is full"):
-        write_results([], {"commit": "newer"}, path)
-    monkeypatch.undo()
-    assert (path.read_bytes(), os.listdir(tmp_path)) == (before, [path.name])

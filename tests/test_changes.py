@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from raycast import TABLE, from_the_side, table_scene
-from scipy import ndimage
 from synthetic import (
     box,
     config_for,
@@ -16,14 +14,12 @@ from synthetic import (
     model_of,
     simulated_scene,
     simulated_views,
-    sphere,
     vertices,
 )
 
 from caryatid.config import Config, RegistrationConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
-from caryatid.objects.changes import PRIOR_ODDS, Sight, likelihood_ratio
 from caryatid.scene import Scene
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.world import posed, poses_of
@@ -95,22 +91,6 @@ def test_what_somebody_put_down_is_new(segmentation, state):
     assert scene.graph[scene.changes[0].object_id].shape.kind == "sphere"
 
 
-def test_a_pose_is_not_to_blame_for_a_change_that_is_noticed(state, caplog):
-    without = state.copy()
-    without[1:4, 2] += 50.0
-    scene = model_of(views_of(without, [0.0, 120.0, 240.0]))
-    scene.update(*views_of(state, [200.0]))
-    assert kinds(scene) == [("added", f"o{k}") for k in (2, 3, 4)]
-    assert caplog.text == ""
-
-
-def test_a_world_that_stays_has_no_history(state):
-    scene = Scene()
-    for view in views_of(state, np.arange(0.0, 360.0, 60.0), "carmine"):
-        scene.update(view)
-    assert scene.changes == ()
-
-
 def test_an_object_without_readings_is_not_gone(scene, state):
     (view,) = views_of(state, [50.0])
     scene.update(replace(view, depth=np.where(view.labels == 5, 0.0, view.depth).astype(np.float32)))
@@ -161,19 +141,6 @@ def test_an_object_that_the_newest_view_did_not_show_can_be_moved_and_then_taken
     assert "o5" not in vertices(scene.graph)
 
 
-@pytest.mark.parametrize("method", ["sg", "pc+sg"])
-def test_what_somebody_moved_out_of_sight_is_in_one_place(method, state):
-    """The view that shows the ball in its new place does not show the old one."""
-    scene = model_of(views_of(state, [0.0, 120.0, 240.0]), config_for(method))
-    before = scene.graph["o5"]
-    state[4, 1] += 0.12
-    (view,) = views_of(state, [50.0])
-    own = ndimage.binary_dilation(view.labels == 5, iterations=2)
-    scene.update(replace(view, depth=np.where(own | (view.labels == 0), view.depth, 0.0).astype(np.float32)))
-    np.testing.assert_allclose(scene.graph["o5"].centre_world - before.centre_world, (0, 0.12, 0), atol=0.01)
-    np.testing.assert_allclose(scene.graph["o5"].shape.extents, before.shape.extents, atol=0.01)
-
-
 def test_what_the_robot_puts_down_has_the_number_of_its_masks_and_no_colour(state):
     without = state.copy()
     without[4, 2] += 50.0
@@ -204,61 +171,3 @@ def test_only_objects_can_be_taken_and_only_what_is_rigid_moves(scene):
     with pytest.raises(InputError, match="add a view first"):
         Scene().added(box((0.0, 0.0, 0.8), (0.1, 0.1, 0.1)))
     assert scene.changes == ()
-
-
-def test_copies_change_by_themselves(scene):
-    other = scene.copy()
-    scene.removed("o4")
-    assert (len(other.graph.objects), other.changes) == (6, ())
-
-
-# What a view says of a shape that it should show
-
-EYE = from_the_side(azimuth=180.0)
-CRATE = box((0.0, 0.0, TABLE + 0.06), (0.1, 0.1, 0.12))
-BALL = sphere((0.0, 0.0, TABLE + 0.06), 0.06)
-
-
-def raycast(*boxes, spheres=()):
-    return table_scene(
-        EYE,
-        [(b.T_world_object[:3, 3], b.extents) for b in boxes],
-        [(s.T_world_object[:3, 3], s.radius) for s in spheres],
-    )
-
-
-def screen(share):
-    """A screen that hides this share of the crate's width."""
-    return box((-0.3, 0.3 + 0.05 - 0.1 * share, TABLE + 0.25), (0.02, 0.6, 0.5))
-
-
-def nearer(distance):
-    """The crate as a wrong registration has it, nearer to the camera [m]."""
-    return CRATE.moved(transforms.rigid(np.eye(3), -distance * EYE[:3, 2]))
-
-
-EMPTY = raycast()
-HALF = np.where(np.arange(640) % 2 == 0, 0.0, EMPTY.depth)
-
-
-@pytest.mark.parametrize(
-    ("shape", "view", "expected"),
-    [
-        pytest.param(CRATE, raycast(CRATE), False, id="a crate is there"),
-        pytest.param(BALL, raycast(spheres=[BALL]), False, id="a ball is there"),
-        pytest.param(CRATE, EMPTY, True, id="a crate is gone"),
-        pytest.param(BALL, EMPTY, True, id="a ball is gone"),
-        pytest.param(CRATE, raycast(screen(1.0)), False, id="hidden"),
-        pytest.param(CRATE, raycast(screen(0.8)), False, id="most of it hidden"),
-        pytest.param(CRATE, raycast(screen(0.2)), True, id="little of it hidden"),
-        pytest.param(nearer(0.016), raycast(CRATE), False, id="an error of registration"),
-        pytest.param(nearer(0.032), raycast(CRATE), True, id="more than an error of registration"),
-        pytest.param(box((0.0, 3.0, TABLE), (0.1, 0.1, 0.1)), EMPTY, False, id="beside the image"),
-        pytest.param(box((-3.0, 0.0, 2.5), (0.1, 0.1, 0.1)), EMPTY, False, id="behind the camera"),
-        pytest.param(CRATE, replace(EMPTY, depth=0.0 * EMPTY.depth), False, id="no reading"),
-        pytest.param(CRATE, replace(EMPTY, depth=HALF), True, id="every other reading"),
-    ],
-)
-def test_a_shape_is_gone_where_readings_lie_behind_its_surface(shape, view, expected):
-    through, there = Sight(view).cells(*shape.surface(0.01))
-    assert (likelihood_ratio(through, there) > PRIOR_ODDS) == expected

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from caryatid.sensing.views import SUPPORT_LABEL
-from caryatid.viz.colours import PALETTE, SALIENCY_STOPS, object_colour, object_stripes, rgb
+from caryatid.viz.colours import PALETTE, object_colour, object_stripes, rgb
 
 VISIONS = {
     "full": np.eye(3),
@@ -51,11 +51,3 @@ def test_28_objects_differ_in_colour_or_stripes():
     looks = [(object_colour(k), object_stripes(k)) for k in range(1, 2 * len(PALETTE) + 1)]
     assert len(set(looks)) == len(looks)
     assert object_stripes(1) == object_stripes(SUPPORT_LABEL) == ()
-
-
-@pytest.mark.parametrize("vision", VISIONS)
-def test_saliency_goes_one_way_for_everyone(vision):
-    """Each stop of the scale differs from each other one; the ends by 60."""
-    apart = differences([colour for _, colour in SALIENCY_STOPS], vision)
-    assert apart[~np.eye(len(apart), dtype=bool)].min() >= 12.0
-    assert apart[0, -1] >= 60.0

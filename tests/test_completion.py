@@ -81,15 +81,6 @@ def test_a_lower_side_that_was_seen_stays_where_it_is_and_a_ball_is_known_from_a
     assert (done.shape, done.why) == (known.shape, "")
 
 
-def test_objects_find_those_below_already_completed():
-    middle = thing(1, box((0.0, 0.0, TABLE_TOP + 0.08), (0.1, 0.1, 0.02)), seen=SIDES_AND_TOP)
-    top = thing(2, box((0.0, 0.0, TABLE_TOP + 0.13), (0.08, 0.08, 0.02)), seen=SIDES_AND_TOP)
-    for order in ((middle, top), (top, middle)):
-        done = {o.id: o.shape for o in completed(*order)}
-        assert lowest(done["o1"]) == pytest.approx(TABLE_TOP)
-        assert abs(lowest(done["o2"]) - highest(done["o1"])) <= CONFIG.overlap
-
-
 def test_what_sticks_in_the_table_is_cut_off_at_its_top():
     sunk = box((0.0, 0.0, TABLE_TOP + 0.02), (0.1, 0.1, 0.06))
     (done,) = completed(thing(1, sunk, seen=SIDES_AND_TOP))
@@ -105,27 +96,6 @@ def test_only_a_side_that_faces_down_is_one_to_rest_on(tilt_deg, extended):
     assert (done.shape.height > tilted.height) == extended
     # The face is tested at points, not on all of its rim.
     assert lowest(done.shape) >= TABLE_TOP - 0.001
-
-
-def test_among_many_objects_it_reaches_down_to_the_first_one_in_its_way():
-    reached_table = 0
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        plate = box((0.0, 0.0, TABLE_TOP + 0.3), (0.1, 0.12, 0.03), turn_deg=20.0)
-        places = zip(*rng.uniform(-0.3, 0.3, (2, 10)), rng.uniform(0.05, 0.25, 10), strict=True)
-        pillars = [cylinder((x, y, TABLE_TOP + height / 2.0), 0.03, height) for x, y, height in places]
-        crowd = [thing(k, pillar) for k, pillar in enumerate(pillars, 2)]
-        done = completed(thing(1, plate, seen=SIDES_AND_TOP), *crowd)[0].shape
-        ticks = np.linspace(-0.5, 0.5, 21)
-        face = np.stack(np.meshgrid(ticks, ticks, [-0.5]), axis=-1).reshape(-1, 3) * done.extents
-        face = transforms.transform(done.T_world_object, face)
-        gap = min(o.shape.signed_distance(face).min() for o in crowd)
-        assert gap > -CONFIG.overlap - 0.001
-        if lowest(done) < TABLE_TOP + 1e-9:
-            reached_table += 1
-        else:
-            assert gap < CONFIG.overlap + 0.001
-    assert 2 <= reached_table <= 10
 
 
 def test_a_neighbour_that_overlaps_its_wall_does_not_stop_a_lower_side():

@@ -46,7 +46,8 @@ STAYS = {"serve", "view"}
 SHORT = {
     "explore": (*SMALL, "--views=2", "--no-report"),
     "demo": (*SMALL, "--views=2", "--no-report"),
-    "clear": (*SMALL, "--no-report"),
+    "clear": (*SMALL, "--no-report", "--set=rehearsal.draws=2", "--risk=0.2", "--set=lift.watch=1.0"),
+    "order": ("--set=rehearsal.draws=2", "--risk=0.2"),
     "extract": ("--no-report",),
 }
 """Few pixels, few views and no report make commands quick here."""
@@ -253,13 +254,3 @@ def test_it_begins_with_a_picture_that_moves_for_ever_at_800_pixels_within_3_meg
     with Image.open(ROOT / first[1]) as film:
         assert (film.width, film.info["loop"]) == (800, 0)
         assert film.n_frames > 30
-
-
-def test_the_citation_is_that_of_the_citation_file():
-    cited = (ROOT / "CITATION.cff").read_text()
-    bibtex = re.search(r"```text\n(.*?)```", README, re.S)[1]
-    fields = re.findall(r"^(?: {4}title|version): (.+)$", cited, re.M)
-    names = [f"{name}," for name in re.findall(r"family-names: (.+)$", cited, re.M)]
-    assert fields
-    assert names
-    assert all(text in bibtex for text in (*fields, *names))

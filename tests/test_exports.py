@@ -98,14 +98,10 @@ def test_urdf_has_the_poses_sizes_and_masses_of_the_model(tmp_path, graph):
             assert np.allclose(T, item.shape.T_world_object, atol=1e-6)
         assert np.allclose(T[:3, 3], item.centre_world, atol=1e-6)
         link = robot.link_map[item.id]
-        geometry = link.collisions[0].geometry
-        match item.shape:
-            case Box():
-                assert np.allclose(geometry.box.size, item.shape.extents)
-            case Cylinder():
-                assert (geometry.cylinder.radius, geometry.cylinder.length) == pytest.approx((0.04, 0.12))
-            case Sphere():
-                assert geometry.sphere.radius == pytest.approx(0.03)
+        solid = getattr(link.collisions[0].geometry, item.shape.kind)
+        sizes = {"size": item.shape.extents} if item.shape.kind == "box" else item.shape.size
+        for name, size in sizes.items():
+            assert np.allclose(getattr(solid, name.replace("height", "length")), size)
         assert link.inertial.mass == pytest.approx(600.0 * item.shape.volume)
         moments = 600.0 * item.shape.mesh(720).moment_inertia
         assert np.allclose(link.inertial.inertia, moments, rtol=0.02, atol=1e-9)

@@ -17,7 +17,6 @@ from bag_files import (
     SECOND,
     START,
     WORLD,
-    BagFile,
     compressed_depth,
     jpeg,
     write_bag,
@@ -27,14 +26,15 @@ from conftest import run_command
 from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
-from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
+from synthetic import random_motion
 
 from caryatid.config import Config, RecordingConfig
 from caryatid.geometry import transforms
 from caryatid.io import read_recording
 from caryatid.io.images import png
 from caryatid.io.importing import choose_views
+from caryatid.io.video import TransformTree
 from caryatid.sources import open_recording
 
 TOPICS = ("--depth", DEPTH, "--info", INFO)
@@ -101,23 +101,6 @@ def test_without_a_world_a_single_frame_without_a_pose_is_taken(tmp_path, views,
 # Encodings
 
 
-def plain_bag(tmp_path, views, depth=None, colour=None, **camera):
-    """A bag with transforms as ROS 1 sent them before tf2; images are made by functions of bag and time."""
-    with BagFile(tmp_path / "one.bag") as bag:
-        layout = "geometry_msgs/TransformStamped[] transforms"
-        bag.store.register(get_types_from_msg(layout, "tf/msg/tfMessage"))
-        for index, view in enumerate(views):
-            time = START + index * SECOND
-            bag.write(INFO, bag.camera(time, **{"K": view.K, "size": (160, 120)} | camera), time)
-            millimetres = np.rint(view.depth * 1000.0).astype(np.uint16)
-            bag.write(DEPTH, depth(bag, time) if depth else bag.image(time, millimetres, "16UC1"), time)
-            if colour:
-                bag.write(RGB, colour(bag, time), time)
-            pose = bag.transform(time, "/" + WORLD, "/" + LENS, view.T_world_camera)
-            bag.write("/tf", bag.type("tf/msg/tfMessage")(transforms=pose.transforms), time)
-    return tmp_path / "one.bag"
-
-
 @pytest.mark.parametrize(
     ("encoding", "big", "padding"),
     [("16UC1", False, 0), ("mono16", True, 6), ("32FC1", False, 8), ("32FC1", True, 0)],
@@ -129,7 +112,9 @@ def test_raw_depth_omits_invalid_readings(tmp_path, views, encoding, big, paddin
     else:
         pixels[:8] = 0.0
         pixels = np.rint(pixels * 1000.0).astype(np.uint16)
-    bag = plain_bag(tmp_path, views[:1], lambda b, t: b.image(t, pixels, encoding, padding=padding, big=big))
+    bag = bag_of(
+        tmp_path, views[:1], depth=lambda b, t: b.image(t, pixels, encoding, padding=padding, big=big)
+    )
     (view,) = imported(tmp_path, bag, *TOPICS)
     assert not view.depth[:8].any()
     metres = views[0].depth if encoding == "32FC1" else pixels * 0.001
@@ -144,7 +129,7 @@ def test_compressed_depth(tmp_path, views, form, atol):
     depth = views[0].depth
     millimetres = np.rint(depth * 1000.0).astype(np.uint16)
     data = compressed_depth(depth, form[:5]) if "compressedDepth" in form else png(millimetres)
-    bag = plain_bag(tmp_path, views[:1], lambda b, t: b.compressed(t, data, form))
+    bag = bag_of(tmp_path, views[:1], depth=lambda b, t: b.compressed(t, data, form))
     (view,) = imported(tmp_path, bag, *TOPICS)
     assert ((view.depth > 0.0) == (depth > 0.0)).all()
     assert np.allclose(view.depth, depth, atol=atol)
@@ -174,12 +159,12 @@ def test_colour(tmp_path, views, pack, encoding):
             return bag.compressed(time, packed, encoding)
         return bag.image(time, np.ascontiguousarray(packed), encoding, padding=5)
 
-    (view,) = imported(tmp_path, plain_bag(tmp_path, views[:1], colour=message), *TOPICS, "--rgb", RGB)
+    (view,) = imported(tmp_path, bag_of(tmp_path, views[:1], colour=message), *TOPICS, "--rgb", RGB)
     assert np.abs(view.rgb.astype(int) - rgb).mean() < (3.0 if encoding == "jpeg" else 1e-9)
 
 
 def test_lens_distortion_is_reported(tmp_path, views, capsys):
-    imported(tmp_path, plain_bag(tmp_path, views[:1], D=(0.1, 0.0, 0.0, 0.0, 0.0)), *TOPICS)
+    imported(tmp_path, bag_of(tmp_path, views[:1], D=(0.1, 0.0, 0.0, 0.0, 0.0)), *TOPICS)
     assert "the lens has distortion" in capsys.readouterr().err
 
 
@@ -268,7 +253,7 @@ def colour_of(columns, frame):
 )
 def test_images_and_cameras_that_do_not_fit_or_cannot_be_decoded(tmp_path, views, unfit, odd, said):
     colour = ("--rgb", RGB) if "colour" in odd else ()
-    unfit(plain_bag(tmp_path, views[:1], **odd), *TOPICS, *colour, says=said)
+    unfit(bag_of(tmp_path, views[:1], **odd), *TOPICS, *colour, says=said)
 
 
 @EACH_KIND
@@ -369,23 +354,25 @@ def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views,
     assert np.allclose(before, after, atol=1e-5)
 
 
-def test_opengl_axes_are_named_before_they_are_levelled(tmp_path, views, unfit):
-    flipped = [replace(view, T_world_camera=view.pose @ np.diag([1.0, -1.0, -1.0, 1.0])) for view in views]
-    options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
-    unfit(
-        tum_folder(tmp_path, flipped),
-        *options,
-        says="look away from what they show: the camera axes are OpenGL's",
-    )
+def flipped(number, view):
+    return view.pose @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, unfit):
-    turned = []
-    for n, view in enumerate(views):
-        T = transforms.rigid(transforms.rotation_from_vector((0.8 * n, 0.3 * n, 0.0)), (n, 0.0, 0.0))
-        turned.append(replace(view, T_world_camera=T @ view.pose))
-    options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
-    unfit(tum_folder(tmp_path, turned), *options, says="1 of 3 views agree on which way is up")
+def turned(number, view):
+    R = transforms.rotation_from_vector((0.8 * number, 0.3 * number, 0.0))
+    return transforms.rigid(R, (number, 0.0, 0.0)) @ view.pose
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (flipped, "look away from what they show: the camera axes are OpenGL's"),
+        (turned, "1 of 3 views agree on which way is up"),
+    ],
+)
+def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, unfit, change, said):
+    folder = tum_folder(tmp_path, [v.with_pose(change(n, v)) for n, v in enumerate(views)])
+    unfit(folder, "--camera", camera_file(tmp_path, views[0].K), "--level", says=said)
 
 
 # Which frames become views
@@ -400,17 +387,6 @@ def test_of_too_many_views_those_farthest_apart_stay():
     along = poses([*np.linspace(0.0, 2.0, 11), 10.0, 20.0])
     chosen = choose_views(np.arange(13) * 1.0, np.ones(13), along, RecordingConfig(max_views=3))
     assert chosen == ([0, 11, 12], {"more than max_views": 10})
-
-
-def test_of_frames_from_one_place_the_sharpest_is_chosen_and_blurred_ones_never():
-    sharpness = np.where(np.arange(10) == 6, 1.2, 1.0)
-    chosen = choose_views(np.arange(10) / 30.0, sharpness, poses(np.zeros(10)), RecordingConfig())
-    assert chosen == ([6], {"same viewpoint as another view": 9})
-    times, sharpness = np.arange(40) * 0.1, np.where(np.arange(40) % 3 == 0, 10.0, 5.0)
-    kept, others = choose_views(times, sharpness, poses(times), RecordingConfig())
-    assert len(kept) > 8
-    assert all(k % 3 == 0 for k in kept)
-    assert others["blurred"] == 26
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 12))
@@ -434,3 +410,40 @@ def test_views_are_few_apart_and_every_frame_is_accounted_for(seed, count, most)
         assert all(
             m or t.magnitude() > np.radians(config.min_angle) for m, t in zip(moved, turns, strict=True)
         )
+
+
+# Frames over time
+
+
+def tree_with(*links, gap=1.0):
+    tree = TransformTree(gap)
+    for parent, child, time, pose, *fixed in links:
+        numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        tree.add(parent, child, time, numbers, fixed=bool(fixed))
+    return tree
+
+
+@pytest.mark.parametrize("late", [-1, SECOND + 1, 3 * SECOND])
+def test_no_pose_is_invented_outside_the_messages_or_across_a_gap(late):
+    rng = np.random.default_rng(1)
+    links = [("map", "eye", START + k * SECOND, random_motion(rng)) for k in (0, 1)]
+    assert tree_with(*links).between("map", "eye", START + late) is None
+    assert tree_with(*links, gap=1.0).between("map", "eye", START + SECOND // 2).shape == (4, 4)
+    assert tree_with(*links, gap=0.9).between("map", "eye", START + SECOND // 2) is None
+
+
+def test_a_frame_that_changes_its_parent_has_no_pose_in_between():
+    rng = np.random.default_rng(3)
+    tree = tree_with(
+        ("map", "cup", START, random_motion(rng)), ("hand", "cup", START + SECOND, random_motion(rng))
+    )
+    assert tree.between("map", "cup", START).shape == (4, 4)
+    for target in ("map", "hand"):
+        assert tree.between(target, "cup", START + 1) is None
+
+
+def test_frames_in_a_circle_and_frames_apart_are_refused():
+    tree = tree_with(("a", "b", START, np.eye(4)), ("b", "a", START, np.eye(4)), ("c", "d", START, np.eye(4)))
+    for target in ("c", "nowhere"):
+        assert tree.between(target, "a", START) is None
+    assert tree.frames == ["a", "b", "c", "d"]

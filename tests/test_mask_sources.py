@@ -137,19 +137,6 @@ def test_what_gives_no_masks_is_refused(tmp_path, channels, capsys):
     assert "reads no views" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("source", "options", "said"),
-    [
-        ("recording", ("--segmentation", "auto"), "--segmentation auto, which uses no masks"),
-        ("table.pcd", (), "masks need images, and a cloud has none"),
-    ],
-)
-def test_masks_that_would_not_be_used_are_refused(tmp_path, capsys, source, options, said):
-    given = ("--masks", tmp_path, *options, "--out", tmp_path / "run")
-    assert run_command("extract", tmp_path / source, *given) == 1
-    assert said in capsys.readouterr().err
-
-
 @pytest.fixture(scope="module")
 def with_arm(tmp_path_factory):
     """A folder with a recording near a tower, the same with an arm in front of the camera, and its mask."""

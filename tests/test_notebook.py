@@ -97,19 +97,6 @@ def test_each_is_one_piece_of_markup_that_loads_and_runs_nothing(shown):
         assert len(html) < 100_000, name
 
 
-def test_the_style_is_the_cells_own_and_its_colours_are_the_pages(scene):
-    """A colour of its own would be lost on a dark page, or on a light one."""
-    style = re.search(r"<style>(.*?)</style>", scene._repr_html_(), re.S)[1]
-    rules = [rule.split("{")[0] for rule in style.split("}") if rule.strip()]
-    parts = [part for rule in rules for part in re.split(r",(?![^(]*\))", rule)]
-    assert len(rules) > 10
-    assert all(part.strip().startswith(".caryatid-cell") for part in parts)
-    assert "background: #" not in style
-    assert not re.search(r"[{;]\s*color:(?!\s*inherit)", style)
-    assert "--ink: currentColor" in style
-    assert not re.search(r"(?<!, )#1d2126", scene._repr_html_())
-
-
 def test_names_from_outside_are_escaped(scene, steps, views):
     o = replace(scene.graph["o1"], why=HOSTILE, doubt=HOSTILE)
     support = replace(scene.graph.supports[0], why=HOSTILE)

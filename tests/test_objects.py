@@ -72,13 +72,16 @@ def test_shapes_are_parted_where_they_meet_and_nowhere_else(shapes, sigma):
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("spread", list(product((0.0, 0.05), repeat=3)))
+@pytest.mark.parametrize("directions", ["up", "none", "any way"])
 @pytest.mark.parametrize("segmentation", ["labels", "auto"])
-def test_points_that_determine_no_shape_do_no_harm(spread, segmentation):
+def test_points_that_determine_no_shape_do_no_harm(spread, directions, segmentation):
     """On a spot, a line or a plane."""
     table, _ = cloud_of((), 0.001)
     places = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3)) * spread + (0.0, 0.0, TABLE + 0.08)
     points = np.concatenate([table.points_world, places])
-    normals = np.concatenate([table.normals_world, np.tile((0.0, 0.0, 1.0), (60, 1))])
+    own = {"up": np.tile((0.0, 0.0, 1.0), (60, 1)), "none": np.zeros((60, 3))}
+    own["any way"] = transforms.unit(np.random.default_rng(1).normal(size=(60, 3)))
+    normals = np.concatenate([table.normals_world, own[directions]])
     labels = np.repeat(np.int32([0, 1]), [len(table), 60])
     scene = model_of([Cloud(points, normals, labels)], segmentation=segmentation)
     for o in scene.graph.objects:

@@ -6,7 +6,6 @@ import ast
 import itertools
 import json
 import re
-import runpy
 import subprocess
 import sys
 import tarfile
@@ -88,19 +87,12 @@ def test_metadata_for_package_indices(built):
 
 def test_the_version_is_written_in_one_place_and_cited():
     assert PROJECT["dynamic"] == ["version"]
-    cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.M)
-    assert cited[1] == caryatid.__version__
+    cited = (ROOT / "CITATION.cff").read_text()
+    fields = re.findall(r"^(?: {4}title|version|.*family-names): (.+)$", cited, re.M)
+    bibtex = re.search(r"```text\n(.*?)```", (ROOT / "README.md").read_text(), re.S)[1]
+    assert caryatid.__version__ in fields
+    assert all(text in bibtex for text in fields)
     assert f"## {caryatid.__version__}" in (ROOT / "CHANGELOG.md").read_text()
-
-
-def test_the_newest_python_of_pyenv_is_tried(tmp_path, monkeypatch):
-    for version in ("3.7.9", "3.7.10", "3.70.1"):
-        (tmp_path / "versions" / version / "bin").mkdir(parents=True)
-        (tmp_path / "versions" / version / "bin/python").touch()
-    monkeypatch.setenv("PYENV_ROOT", str(tmp_path))
-    monkeypatch.setenv("PATH", "")
-    find_python = runpy.run_path(str(ROOT / "tools/package.py"))["find_python"]
-    assert find_python("3.7") == tmp_path / "versions/3.7.10/bin/python"
 
 
 def test_all_that_is_needed_is_pinned():

@@ -6,14 +6,13 @@ import json
 import os
 import subprocess
 import sys
+from threading import Event, Thread
 
-import numpy as np
 import pytest
 from conftest import SMALL
-from numba import njit
+from threadpoolctl import threadpool_info
 
 from caryatid.runtime import parallel
-from caryatid.runtime.parallel import for_each
 
 # Sharing work out
 
@@ -26,51 +25,26 @@ def test_threads_are_those_that_are_asked_for(monkeypatch):
     parallel.cores.cache_clear()
 
 
-OVERLAPPING = """
-import sys
-from threading import Event, Thread
-import numpy
-from threadpoolctl import threadpool_info
-from caryatid.runtime.parallel import one_blas_thread
-
-def threads():
-    return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
-
-usual, running, ends = threads(), [Event(), Event()], [Event(), Event()]
-
-@one_blas_thread
-def run(number):
-    running[number].set()
-    ends[number].wait()
-
-started = [Thread(target=run, args=(number,)) for number in range(2)]
-for thread, event in zip(started, running):
-    thread.start()
-    event.wait()
-assert set(threads()) == {1}, threads()
-for number in map(int, sys.argv[1:]):
-    ends[number].set()
-    started[number].join()
-assert threads() == usual, threads()
-"""
-
-
-@pytest.mark.parametrize("order", ["01", "10"])
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_blas_gets_its_threads_back_after_functions_that_overlap(order):
-    subprocess.run([sys.executable, "-c", OVERLAPPING, *order], check=True, timeout=60.0)
+    def threads():
+        return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
 
+    @parallel.one_blas_thread
+    def run(number):
+        running[number].set()
+        ends[number].wait(20.0)
 
-@njit
-def add_scaled(index, data):
-    numbers, factor, results = data
-    results[index] += factor * numbers[index]
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 100])
-def test_each_piece_of_work_is_done_once(count):
-    numbers, results = np.arange(100.0), np.zeros(100)
-    for_each(add_scaled, count, (numbers, 3.0, results))
-    np.testing.assert_array_equal(results, np.where(np.arange(100) < count, 3.0 * numbers, 0.0))
+    usual, running, ends = threads(), [Event(), Event()], [Event(), Event()]
+    started = [Thread(target=run, args=(number,)) for number in range(2)]
+    for thread, event in zip(started, running, strict=True):
+        thread.start()
+        assert event.wait(20.0)
+    assert set(threads()) == {1}
+    for number in order:
+        ends[number].set()
+        started[number].join()
+    assert threads() == usual
 
 
 # Kernels on disk

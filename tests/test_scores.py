@@ -134,12 +134,6 @@ def test_masks_match_objects_in_real_frames():
         masked(np.zeros((3, 3), np.int32))
 
 
-def test_without_a_true_table_the_extracted_one_is_wrong():
-    result = masked(SEEN, VERTICES[1:], frozenset({("object5", "object7")}))
-    assert result.vertex_precision == pytest.approx(2 / 3)
-    assert result.edge_precision == 0.5
-
-
 def write_run(folder, *views):
     """A run of graphs with label images and names."""
     with RunWriter(folder, Config(), {"source": "two", "seed": 0, "options": {}}) as run:

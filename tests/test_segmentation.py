@@ -10,14 +10,15 @@ import pytest
 from raycast import TABLE, from_the_side, table_scene
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
-from synthetic import model_of
+from synthetic import TABLE_TOP, model_of, simulated_cloud, simulated_views
 
-from caryatid.config import CloudConfig
-from caryatid.errors import PerceptionError
+from caryatid.config import CloudConfig, Config
+from caryatid.errors import InputError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Cylinder
-from caryatid.sensing.clouds import oriented_points, thin
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud
+from caryatid.segmentation.observation import level_transform, observe
+from caryatid.sensing.clouds import oriented_points
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.generation import bowl
 from caryatid.simulation.world import Body, build_spec, scene_from_spec
@@ -210,36 +211,46 @@ def test_a_support_surface_leans_by_at_most_ten_degrees(degrees, level):
         np.testing.assert_allclose(surface.normal_world, R[:, 2], atol=1e-6)
 
 
-@pytest.mark.parametrize("turned", [False, True], ids=["upright", "upside down"])
-def test_without_a_pose_table_and_objects_are_found(turned):
-    view = table_scene(from_the_side(distance=1.0), STACK, [BALL], sigma=0.001)
-    if turned:
-        view = replace(view, depth=view.depth[::-1, ::-1].copy(), labels=view.labels[::-1, ::-1].copy())
-    scene = model_of([replace(view, T_world_camera=None)], segmentation="auto")
-    labels = np.where(scene.labels == SUPPORT_LABEL, 0, scene.labels)
-    assert found(labels, view.labels) == (3, 3, 3)
-    assert scene.T_world_camera[2, 3] == pytest.approx(view.pose[2, 3] - TABLE, abs=0.01)
+# Views and clouds of no use
+
+CONFIG = Config()
+VIEW = simulated_views("tower")[0]
 
 
-def test_a_cloud_comes_apart_like_the_view():
-    points, normals, truth = [], [], []
-    for azimuth in (0, 120, 240):
-        view = table_scene(from_the_side(azimuth), STACK, [BALL], sigma=0.001)
-        p, n, pixels = oriented_points(view, CloudConfig())
-        points.append(p)
-        normals.append(n)
-        truth.append(view.labels.ravel()[pixels])
-    index = thin(np.concatenate(points), 0.005)
-    cloud = Cloud(np.concatenate(points)[index], np.concatenate(normals)[index])
-    assert found(labels_of(cloud), np.concatenate(truth)[index]) == (3, 3, 3)
+def observation_of(source, segmentation=None, known=None, config=CONFIG):
+    return observe(source, config, segmentation=segmentation, known=known, rng=np.random.default_rng(0))
 
 
-def test_masks_that_are_too_wide_label_nothing_far_behind_their_objects():
-    """Three pixels around the tower the masks show the floor, 75 cm below the small table."""
-    view = table_scene(from_the_side(elevation=20.0), STACK, half_table=(0.12, 0.25))
-    wide = replace(view, labels=ndimage.grey_dilation(view.labels, size=7))
-    assert (wide.labels > 0).sum() > 1.05 * (view.labels > 0).sum()
-    cloud = model_of([wide]).cloud
-    shown = cloud.points_world[np.isin(cloud.labels, (1, 2))]
-    assert len(shown) > 500
-    assert shown[:, 2].min() > TABLE - 0.05
+@pytest.mark.parametrize("source", [VIEW, simulated_cloud("tower")], ids=["view", "cloud"])
+def test_labels_that_are_demanded_and_missing_are_an_error(source):
+    with pytest.raises(InputError, match="has no labels") as caught:
+        observation_of(replace(source, labels=None), "labels")
+    assert source.name in str(caught.value)
+    assert "auto" in caught.value.remedy
+
+
+@pytest.mark.parametrize("pose", [VIEW.T_world_camera, None], ids=["posed", "not posed"])
+def test_nothing_is_an_error_that_names_it(pose):
+    with pytest.raises(PerceptionError, match="frame 7: has no depth readings"):
+        observation_of(View(np.zeros((60, 80)), VIEW.K, pose, name="frame 7"))
+    nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3)), name="cloud 7")
+    with pytest.raises(PerceptionError, match="cloud 7: has no points"):
+        observation_of(nothing)
+    rng = np.random.default_rng(0)
+    noise = Cloud(rng.normal(size=(500, 3)), transforms.unit(rng.normal(size=(500, 3))), name="noise")
+    for cloud in (nothing, noise):
+        with pytest.raises(PerceptionError, match=f"{cloud.name}: "):
+            level_transform(cloud, CONFIG, rng)
+
+
+def test_a_cloud_in_its_sensors_frame_is_levelled():
+    observation = observation_of(VIEW, "labels")
+    T_camera_world = transforms.invert(VIEW.pose)
+    world = replace(observation.cloud, labels=VIEW.labels.ravel()[observation.pixels])
+    stored = world.moved(T_camera_world)
+    level = stored.moved(level_transform(stored, CONFIG, np.random.default_rng(0), use_labels=True))
+    above = world.points_world[:, 2] - TABLE_TOP
+    np.testing.assert_allclose(level.points_world[:, 2], above, atol=0.003)
+    np.testing.assert_allclose(level.normals_world[:, 2], world.normals_world[:, 2], atol=0.005)
+    assert level.viewpoint_world[2] == pytest.approx(VIEW.pose[2, 3] - TABLE_TOP, abs=0.003)
+    assert np.array_equal(level.labels, stored.labels)

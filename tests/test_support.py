@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -109,27 +108,6 @@ class TestContacts:
         assert [(c.a, c.b) for c in find_contacts([cube(0, 0, 0), near], margin)] == [(0, 1)]
         assert find_contacts([cube(0, 0, 0), far], margin) == []
 
-    @pytest.mark.parametrize(
-        ("upper", "lower"),
-        [
-            (cube(0, 0, 0.1), cube(0, 0, 0)),
-            (Cylinder(at(0, 0, 0.1), 0.03, 0.1), cube(0, 0, 0)),
-            (Sphere(at(0, 0, 0.08), 0.03), Cylinder(at(0, 0, 0), 0.04, 0.1)),
-            (Cylinder(at(0, 0, 0.1), 0.03, 0.1), Cylinder(at(0, 0, 0), 0.04, 0.1)),
-            (Sphere(at(0, 0, 0.08), 0.03), Sphere(at(0, 0, 0), 0.05)),
-        ],
-    )
-    def test_every_pair_of_kinds_touches_with_the_normal_from_a_to_b(self, upper, lower):
-        for gap in (0.004, -0.004):
-            lifted = upper.moved(at(0, 0, gap))
-            (up,) = find_contacts([lower, lifted], 0.01)
-            (down,) = find_contacts([lifted, lower], 0.01)
-            np.testing.assert_allclose(up.normal_world, (0, 0, 1), atol=1e-3)
-            np.testing.assert_allclose(down.normal_world, (0, 0, -1), atol=1e-3)
-            assert up.distance == pytest.approx(gap, abs=1e-4)
-            np.testing.assert_allclose(up.points_world[:, 2].mean(), 0.05 + gap / 2.0, atol=1e-3)
-            np.testing.assert_allclose(up.point_world, up.points_world.mean(axis=0), atol=1e-12)
-
     def test_distances_agree_with_the_signed_distance_whatever_was_asked_before(self):
         rng = np.random.default_rng(3)
         seen = 0
@@ -155,12 +133,6 @@ class TestContacts:
         alone = [gaps(shapes) for shapes in scenes]
         with ThreadPoolExecutor(4) as pool:
             assert list(pool.map(gaps, scenes)) == alone
-
-    def test_few_shapes_and_bad_margins(self):
-        assert find_contacts([], 0.01) == find_contacts([cube(0, 0, 0)], 0.01) == []
-        for bad in (-0.001, float("nan")):
-            with pytest.raises(InputError, match="margin"):
-                find_contacts([cube(0, 0, 0), cube(0, 0, 0.1)], bad)
 
 
 def let_down(right):
@@ -250,6 +222,8 @@ class TestInfer:
     def test_a_graph_says_how_sure_and_how_steady_all_is(self):
         graph = infer(tower(), CONFIG)
         assert all(s.certain and s.occurrences == s.opportunities == 1 for s in graph.supports)
+        assert {k.probability for k in (*graph.objects, *graph.supports)} == {1.0}
+        assert {s.probability for s in infer(tower(), PAPER).supports} == {None}
         assert [o.id for o in graph.objects] == ["o0", "o1", "o2", "o3", "o4"]
         assert {k for k, s in graph.stability.items() if s.stable} == {"o1", "o2", "o3", "o4"}
         for support in graph.supports:
@@ -257,8 +231,6 @@ class TestInfer:
         np.testing.assert_allclose(graph.support("o1", "o2").contact_world, (0.01, 0.0, 0.08), atol=2e-3)
         assert infer(falling_plank(), CONFIG).stability["o1"].tips
         assert edges(infer(leaning_plank(0.008), CONFIG))["o2", "o1"] == "lean"
-        with pytest.raises(InputError, match="same id"):
-            infer([*tower(), tower()[1]], CONFIG)
 
     def test_a_counterweight_holds_top_down(self):
         graph = infer(counterweight(), replace(CONFIG, draws=60))
@@ -288,21 +260,6 @@ class TestInfer:
         assert support.doubtful
         assert support.kind == "bottom-up"
 
-    def test_what_could_carry_a_floating_board_shares_the_probability(self):
-        """A ball is nearest, two pillars are a little further below, and any of them may be hidden higher."""
-        pillars = [block(0, y, 0, (0.06, 0.06, 0.11)) for y in (-0.15, 0.15)]
-        ball, board = Sphere(at(0.01, 0.0, 0.085), 0.03), block(0, 0, 0.13, (0.16, 0.42, 0.02))
-        graph = infer(scene(*pillars, ball, board, uncertainty=unsure(0.002, 0.0)), replace(CONFIG, draws=60))
-        assert {s.supporter for s in graph.supporters("o4")} >= {"o1", "o2"}
-        assert all(s.doubtful for s in graph.supporters("o4"))
-
-    def test_what_touches_nothing_is_let_down_by_so_much_at_most(self):
-        objects = scene(block(0, 0, 0, (0.1, 0.1, 0.05)), block(0.02, 0, 0.08, (0.05, 0.05, 0.05)))
-        graph = infer(objects, CONFIG)
-        assert set(edges(graph)) == {("o0", "o1"), ("o1", "o2")}
-        assert graph.stability["o2"].overhang == pytest.approx(-0.025, abs=1e-3)
-        assert [s.pair for s in infer(objects, replace(CONFIG, max_drop=0.02)).supports] == [("o0", "o1")]
-
     @pytest.mark.parametrize(
         ("objects", "pair", "said"),
         [
@@ -314,9 +271,7 @@ class TestInfer:
                 ("o4", "o5"),
                 "o5 rests without it (gap 1.0 mm, normal 90° from the vertical). Probability 0.00.",
             ),
-            (STEADY, ("o2", "o3"), "o3 rests without it (gap 9.0 mm"),
             (leaning_plank(), ("o2", "o1"), "o1 leans on o2 with"),
-            (HELD["in the air"][0], ("o0", "o1"), "they do not touch, gap 370.0 mm"),
             (HELD["sunk in the table"][0], ("o1", "o0"), "nothing supports it"),
         ],
     )
@@ -329,47 +284,28 @@ class TestInfer:
     def test_why_on_paper_and_of_whom_it_cannot_be_asked(self):
         graph = infer_by_area(tower(), PAPER)
         assert explain(graph, "o2", "o1", PAPER).startswith("o2 does not support o1: o2 is not")
-        for pair, said in ((("o1", "o9"), "not an object of the graph"), (("o1", "o1"), "itself")):
-            with pytest.raises(InputError, match=said):
-                explain(graph, *pair, CONFIG)
 
 
-SCENES = Path(__file__).parents[2] / "shared" / "scenes"
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not SCENES.is_dir(), reason="needs ../shared/scenes")
-def test_true_shapes_of_the_shared_primitive_scenes_give_their_edges():
-    from caryatid.simulation.scenes import load_scene
-    from caryatid.simulation.truth import read_truth
-    from caryatid.simulation.world import static_boxes, true_shapes
-
-    right = wrong = missed = 0
-    for folder in [f for f in sorted(SCENES.iterdir()) if not f.name.startswith(("ycb", "house", "storey"))]:
-        loaded = load_scene(str(folder / "scene.xml"))
-        names = {0: "table", **loaded.object_bodies}
-        objects = [
-            SceneObject(names[k], k, shape, "object" if k else "support_surface")
-            for k, shape in {0: static_boxes(loaded)[0], **true_shapes(loaded)}.items()
-        ]
-        truth = read_truth(folder / "gt.json").pairs
-        found = set(edges(infer(objects, CONFIG)))
-        right += len(found & truth)
-        wrong += len(found - truth)
-        missed += len(truth - found)
-    assert right / (right + wrong) >= 0.97
-    assert right / (right + missed) >= 0.97
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (lambda graph: explain(graph, "o1", "o9", CONFIG), "not an object of the graph"),
+        (lambda graph: explain(graph, "o1", "o1", CONFIG), "itself"),
+        (lambda graph: predict_removal(graph, "o9", CONFIG), "not an object of the graph"),
+        (lambda graph: predict_removal(graph, "o0", CONFIG), "support surface"),
+        (lambda graph: infer([*tower(), tower()[1]], CONFIG), "same id"),
+        (lambda graph: find_contacts([cube(0, 0, 0), cube(0, 0, 0.1)], -0.001), "margin"),
+        (lambda graph: find_contacts([cube(0, 0, 0), cube(0, 0, 0.1)], float("nan")), "margin"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(ask, said):
+    with pytest.raises(InputError, match=said):
+        ask(infer(tower(), CONFIG))
 
 
 class TestProbabilities:
     def likely(self, objects, config=CONFIG, seed=0):
         return {s.pair: s.probability for s in infer(objects, config, np.random.default_rng(seed)).supports}
-
-    def test_what_nothing_speaks_against_is_certain(self):
-        assert set(self.likely(tower()).values()) == {1.0}
-        graph = infer(tower(), CONFIG)
-        assert [o.probability for o in graph.objects] == [1.0] * 5
-        assert all(s.probability is None for s in infer_by_area(tower(), PAPER).supports)
 
     def test_a_counterweight_of_unknown_weight_holds_as_often_as_it_is_heavy_enough(self):
         """The plank's moment is 4.32·10⁻⁴·0.09 m⁴, the weight's 4.52·10⁻⁴·0.05 m⁴.
@@ -400,12 +336,6 @@ class TestProbabilities:
         _, sure = infer(scene(cube(0, 0, 0.05), uncertainty=unsure(0.001)), CONFIG).objects
         assert sure.probability == 1.0
         assert 0.3 < guessed.probability < 0.9
-
-    def test_draws_come_from_the_generator(self):
-        objects = [replace(o, uncertainty=unsure(0.003, 0.01)) for o in counterweight()[1:]]
-        objects = [SURFACE, *objects]
-        assert self.likely(objects, seed=1) == self.likely(objects, seed=1)
-        assert self.likely(objects, seed=1) != self.likely(objects, seed=2)
 
 
 LEGS = [block(x, y, 0, (0.05, 0.05, 0.1)) for x in (-0.1, 0.1) for y in (-0.1, 0.1)]
@@ -463,25 +393,17 @@ class TestRemoval:
         (effect,) = predict_removal(replace(graph, supports=(*graph.supports, earlier)), "o4", CONFIG)
         assert (effect.object_id, effect.probability) == ("o3", pytest.approx(0.6))
 
-    def test_unknown_objects_and_the_table_are_refused(self):
-        graph = infer(tower(), CONFIG)
-        with pytest.raises(InputError, match="not an object of the graph"):
-            predict_removal(graph, "o9", CONFIG)
-        with pytest.raises(InputError, match="support surface"):
-            predict_removal(graph, "o0", CONFIG)
-
 
 def thing(label, centre, known, size=(0.1, 0.1, 0.1)):
     return SceneObject(f"o{label}", label, Box(rigid(np.eye(3), centre), np.array(size)), uncertainty=known)
 
 
-HOVERING = (0.0, 0.0, 0.055)
 CAN = Cylinder(at(0, 0, 0.05), 0.04, 0.1)
 
 
 class TestReconcile:
     @pytest.mark.parametrize(
-        "shape", [cube(*HOVERING), Cylinder(at(*HOVERING), 0.03, 0.1), Sphere(at(*HOVERING), 0.05)]
+        "shape", [cube(0, 0, 0.055), Cylinder(at(0, 0, 0.055), 0.03, 0.1), Sphere(at(0, 0, 0.055), 0.05)]
     )
     def test_what_hovers_is_let_down_onto_what_carries_it(self, shape):
         hovering = SceneObject("o1", 1, shape, uncertainty=unsure(0.004))
@@ -517,9 +439,3 @@ class TestReconcile:
         table, after = reconcile([SURFACE, floating], PLAUSIBLE)
         assert after.doubt == "floats over o0 by 8 mm, more than both fits explain"
         assert table.doubt == ""
-
-    def test_without_uncertainty_or_rounds_nothing_moves(self):
-        unknown = [SURFACE, thing(1, (0, 0, 0.045), None)]
-        np.testing.assert_array_equal(reconcile(unknown, PLAUSIBLE)[1].centre_world, (0, 0, 0.045))
-        sure = [SURFACE, thing(1, (0, 0, 0.048), unsure(0.01))]
-        assert reconcile(sure, replace(PLAUSIBLE, rounds=0))[1] is sure[1]

@@ -1,21 +1,27 @@
-"""Scenes: from MJCF, built in, generated, written; their solids, and the ground truth physics gives."""
+"""Scenes and their ground truth, the depth camera, and the body of the humanoid."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from conftest import SMALL_SENSOR, TWO_ON_A_TABLE
+from synthetic import simulated_scene
 
-from caryatid.config import LiftConfig, PhysicsConfig
+from caryatid.config import Config, LiftConfig, NoiseConfig, PhysicsConfig, RobotConfig
 from caryatid.errors import InputError
+from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Shape
+from caryatid.planning.posture import Posture
+from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation import (
-    GroundTruth,
+    SimulatedCamera,
     SimulatedScene,
-    TrueEdge,
     generate,
     ground_truth,
     list_scenes,
@@ -24,18 +30,21 @@ from caryatid.simulation import (
     static_boxes,
     table_centre,
     true_shapes,
-    write_truth,
 )
+from caryatid.simulation.camera import add_depth_noise, axial_sigma
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.scenes import DESIGNED, is_builtin
+from caryatid.simulation.setup import HumanoidBody, make_simulation
 from caryatid.simulation.world import bounds, poses_of, scene_from_spec, state_of
+
+# Scenes
+
 
 SHARED = Path(__file__).parents[2] / "shared" / "scenes"
 NEEDS_SHARED = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared is absent")
 
 TABLE = '<body name="table"><geom name="top" type="box" size="0.3 0.45 0.02" pos="0 0 0.73"/></body>'
 CUBE = '<body name="cube" pos="0 0 0.78"><freejoint/><geom type="box" size="0.03 0.02 0.03"/></body>'
-EASY = {"vertices": ["table", "a"], "edges": [{"supporter": "table", "supported": "a"}]}
 INTENDED = {
     "tower": {("table", 0), (0, 1), (1, 2), (2, 3), ("table", 4)},
     "bridge": {("table", 0), ("table", 1), ("table", 4), (0, 2), (1, 2), (2, 3)},
@@ -76,18 +85,6 @@ def test_what_falls_off_or_does_not_come_to_rest_is_warned_of(tmp_path, caplog):
     assert "high.xml: the scene still moves" in caplog.text
 
 
-def test_objects_are_the_free_bodies_in_their_order():
-    ball = '<body name="ball" pos="0.1 0.2 0.78"><freejoint/><geom type="sphere" size="0.03"/></body>'
-    wall = '<geom name="wall" type="box" size="0.03 1 1" pos="0.7 0 1"/>'
-    scene = scene_of(wall + ball + TABLE + CUBE)
-    assert scene.object_bodies == {1: "ball", 2: "cube"}
-    labels = {
-        scene.model.geom(g).name or "unnamed": int(scene.geom_labels[g]) for g in range(scene.model.ngeom)
-    }
-    assert labels["wall"] == labels["top"] == labels["floor"] == 0
-    assert sorted(scene.geom_labels[scene.geom_labels > 0]) == [1, 2]
-
-
 def test_a_body_welded_to_an_object_belongs_to_it():
     mug = (
         '<body name="mug" pos="0 0 0.8"><freejoint/><geom type="cylinder" size="0.04 0.05"/>'
@@ -99,16 +96,6 @@ def test_a_body_welded_to_an_object_belongs_to_it():
     (shape,) = true_shapes(scene).values()
     assert shape.kind == "solid"
     assert shape.signed_distance(handle) < 0.0
-
-
-def test_a_scene_at_rest_keeps_its_poses_and_one_in_the_air_falls():
-    resting = scene_of(TABLE + CUBE)
-    again = scene_from_spec(resting.spec, "test", "test.xml")
-    np.testing.assert_array_equal(resting.data.qpos, again.data.qpos)
-    falling = scene_of(TABLE + CUBE.replace("0.78", "0.95"))
-    assert falling.at_rest
-    assert falling.data.body("cube").xpos[2] == pytest.approx(0.78, abs=1e-3)
-    np.testing.assert_array_equal(falling.data.qvel, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -131,18 +118,6 @@ def test_volumes_of_shapes_in_their_bounds(geom: str, volume: float):
     distance = true_shapes(scene)[1].signed_distance
     assert (distance(points) < 0.0).mean() * np.prod(high - low) == pytest.approx(volume, rel=0.03)
     assert (distance(points + (high - low) * [1.0, 0.0, 0.0]) > 0.0).all()
-
-
-@pytest.mark.parametrize(
-    ("size", "turn", "middle"),
-    [
-        ("0.02 0.45 0.3", "0 90 0", [0.0, 0.0, 0.75]),
-        ("0.3 0.45 0.02", "5 0 0", [0.0, -0.02 * np.sin(np.pi / 36.0), 0.73 + 0.02 * np.cos(np.pi / 36.0)]),
-    ],
-)
-def test_the_middle_of_a_table_that_is_turned_is_in_its_upper_face(size, turn, middle):
-    scene = scene_of(TABLE.replace('size="0.3 0.45 0.02"', f'size="{size}" euler="{turn}"') + CUBE)
-    np.testing.assert_allclose(table_centre(scene), middle, atol=1e-9)
 
 
 # Built-in and generated scenes
@@ -185,7 +160,7 @@ def test_piles_are_settled_and_of_the_size(size: int, seed: int):
     assert sum(supporter != "table" for supporter, _, _ in edges_of(scene)) >= size // 3
 
 
-@pytest.mark.parametrize(("size", "seed"), [(10, 0), pytest.param(25, 2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("size", "seed"), [(10, 0), (14, 2)])
 def test_dense_scenes_have_screens_a_heap_and_walls(size: int, seed: int):
     scene = generate("dense", size, seed)
     shapes = true_shapes(scene).values()
@@ -271,33 +246,202 @@ def test_physics_agrees_with_the_given_ground_truth():
     assert found - common <= 0.02 * given
 
 
-def test_truth_files_come_back_and_the_kind_may_be_missing(tmp_path: Path):
-    truth, path = ground_truth(load_scene("counterweight")), tmp_path / "gt.json"
-    write_truth(truth, path)
-    assert read_truth(path) == truth
-    edge = {"supporter": "table", "supported": "object0", "kind": "bottom-up"}
-    assert json.loads(path.read_text())["edges"][0] == edge
-    easy = read_truth(write(path, json.dumps(EASY)))
-    assert easy == GroundTruth(("table", "a"), (TrueEdge("table", "a"),))
-    assert easy.pairs == {("table", "a")}
+# Camera
+
+
+FROM_THE_ROBOT = transforms.look_at((-1.2, 0.1, 1.6), (0.0, 0.0, 0.8))
+NOISE = NoiseConfig()
+
+
+@pytest.fixture(scope="module")
+def clutter() -> SimulatedScene:
+    return load_scene("clutter")
+
+
+def camera(scene: SimulatedScene, noise="none", seed: int = 0) -> SimulatedCamera:
+    return SimulatedCamera(scene, noise, rng=np.random.default_rng(seed), sensor=SMALL_SENSOR)
+
+
+def table_scene(extra: str = "") -> SimulatedScene:
+    xml = TWO_ON_A_TABLE.replace("</worldbody>", f"{extra}</worldbody>")
+    return scene_from_spec(mujoco.MjSpec.from_string(xml), "test", "test.xml")
+
+
+def noisy(depth, incidence=0.0) -> np.ndarray:
+    depth = np.asarray(depth, dtype=float)
+    angles = np.broadcast_to(incidence, depth.shape)
+    return add_depth_noise(depth, angles, NOISE, np.random.default_rng(0))
+
+
+def assert_same(one, other) -> None:
+    np.testing.assert_array_equal(one.depth, other.depth)
+    np.testing.assert_array_equal(one.pose, other.pose)
+
+
+def test_points_lie_on_the_shapes_their_labels_name(clutter):
+    view = camera(clutter).capture(FROM_THE_ROBOT)
+    np.testing.assert_array_equal(view.pose, FROM_THE_ROBOT)
+    points_world = transforms.transform(view.pose, view.points_camera)
+    normals_world = transforms.rotate(view.pose, view.normals_camera.astype(np.float64))
+    shapes = {label: s for label, s in true_shapes(clutter).items() if (view.labels == label).any()}
+    assert len(shapes) >= 6
+    for label, shape in shapes.items():
+        mask = view.labels == label
+        np.testing.assert_allclose(shape.signed_distance(points_world[mask]), 0.0, atol=1e-5)
+        step = shape.signed_distance(points_world[mask] + 0.001 * normals_world[mask])
+        assert np.median(step) == pytest.approx(0.001, abs=1e-5)
+    assert (np.einsum("hwi,hwi->hw", view.points_camera, view.normals_camera)[view.valid] < 1e-9).all()
+
+
+def test_group_3_is_not_seen_and_nothing_is_nothing():
+    cover = '<geom type="box" size="0.3 0.3 0.3" pos="0 0 1.1" group="{}" contype="0" conaffinity="0"/>'
+    T = transforms.look_at((-1.2, 0.0, 1.3), (0.0, 0.0, 0.8))
+    hidden, shown, plain = (
+        camera(table_scene(extra)).capture(T) for extra in (cover.format(3), cover.format(0), "")
+    )
+    np.testing.assert_array_equal(hidden.depth, plain.depth)
+    assert (shown.depth != plain.depth).any()
+    assert not plain.valid[0].any()
+    assert (plain.labels[~plain.valid] == 0).all()
+    assert (plain.normals_camera[~plain.valid] == 0).all()
+
+
+@pytest.mark.parametrize("noise", ["none", "carmine"])
+def test_captures_depend_on_seed_and_number_alone(clutter, noise):
+    elsewhere = transforms.look_at((0.0, 1.2, 1.6), (0.0, 0.0, 0.8))
+
+    def captures(seed: int, *poses) -> list:
+        taken = camera(clutter, noise, seed)
+        return [taken.capture(T) for T in (*poses, FROM_THE_ROBOT)]
+
+    a, b = captures(1, FROM_THE_ROBOT), captures(1, elsewhere)
+    assert_same(a[1], b[1])
+    other = captures(2, FROM_THE_ROBOT)
+    assert (a[0].depth != a[1].depth).any() == (noise == "carmine")
+    assert (a[0].depth != other[0].depth).any() == (noise == "carmine")
+    assert np.allclose(a[0].pose, a[1].pose) == (noise == "none")
+
+
+@pytest.mark.parametrize("z", [0.6, 1.5, 2.5])
+def test_axial_noise_has_the_published_size_and_depths_are_quantised(z):
+    found = noisy(np.full((200, 200), z))
+    step = NOISE.disparity_step * z * z
+    expected = np.hypot(axial_sigma(np.array(z), NOISE), step / np.sqrt(12.0))
+    assert found.std() == pytest.approx(float(expected), rel=0.03)
+    levels = 1.0 / (found * NOISE.disparity_step)
+    np.testing.assert_allclose(levels, np.round(levels), atol=1e-6)
+    assert axial_sigma(np.array(1.4), NOISE) == pytest.approx(0.0031)
+
+
+def test_no_return_at_grazing_angles_edges_and_out_of_range():
+    depth, incidence = np.full((20, 40), 1.0), np.zeros((20, 40))
+    depth[:, 20:] = 1.5
+    incidence[:5] = np.deg2rad(NOISE.grazing + 1.0)
+    seen = noisy(depth, incidence) > 0.0
+    assert not seen[:5].any()
+    assert not seen[:, 19:21].any()
+    assert seen[5:, :19].all()
+    assert seen[5:, 21:].all()
+    assert not any(noisy(np.full((20, 20), z)).any() for z in (0.2, 3.2, 0.0))
+
+
+def test_bad_arguments(clutter):
+    with pytest.raises(InputError, match="kinect"):
+        camera(clutter, "kinect")
+    with pytest.raises(InputError, match="rotation"):
+        camera(clutter).capture(np.diag([1.0, 2.0, 1.0, 1.0]))
+
+
+# Body
+
+
+FEW_PIXELS = replace(Config(), sensor=SMALL_SENSOR)
+SLOW = pytest.mark.slow
+
+
+def stage(name: str, config: Config = FEW_PIXELS):
+    """A simulation, the body of its robot, and the view sphere."""
+    scene = simulated_scene(name)
+    made = make_simulation(scene, config, noise="none", seed=0)
+    body = HumanoidBody(scene, made.robot, config.robot)
+    return made, body, ViewSphere.around(table_centre(scene), config.active)
+
+
+def between(one: Posture, other: Posture):
+    """Postures at most 5 mm apart on the straight line between two."""
+    length = np.linalg.norm((other.platform_world - one.platform_world)[:2])
+    for share in np.linspace(0.0, 1.0, 2 + int(length / 0.005)):
+        platform, height = (
+            (1.0 - share) * np.asarray(getattr(one, name)) + share * np.asarray(getattr(other, name))
+            for name in ("platform_world", "camera_height")
+        )
+        yield Posture(platform, float(height), 0.0, 0.0)
+
+
+def clearance(body: HumanoidBody) -> float:
+    """How near a body is to anything but the floor [m], negative inside."""
+    model, data = body.scene.model, body.scene.data
+    mine = np.flatnonzero(model.geom_bodyid == model.body("robot").id).tolist()
+    others = [g for g in range(model.ngeom) if g not in mine and model.geom(g).name != "floor"]
+    return min(mujoco.mj_geomDistance(model, data, a, b, 10.0, None) for a in mine for b in others)
 
 
 @pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ('{"vertices": [', "broken JSON"),
-        ("[]", "expected a JSON object"),
-        (json.dumps({**EASY, "vertices": "table"}), "'vertices'"),
-        (json.dumps({**EASY, "vertices": ["table", "a", "a"]}), "twice"),
-        (json.dumps({"vertices": ["table"]}), "'edges'"),
-        (json.dumps({**EASY, "edges": [3]}), "edges: '0' is 3"),
-        (json.dumps({**EASY, "vertices": ["table", "b"]}), "'a', which is not a vertex"),
-        (json.dumps({**EASY, "edges": [{"supported": "a"}]}), "edges.0: the key 'supporter' is missing"),
-        (json.dumps({**EASY, "edges": [{**EASY["edges"][0], "kind": "glue"}]}), "glue.*bottom-up"),
-    ],
+    "name",
+    [*DESIGNED, *(pytest.param(n, marks=SLOW) for n in ("pile-8-3", "dense-12-0", "packed-20-0"))],
 )
-def test_broken_truth_files_are_refused_by_name(tmp_path: Path, text: str, reason: str):
-    path = write(tmp_path / "gt.json", text)
-    with pytest.raises(InputError, match=reason) as error:
-        read_truth(path)
-    assert str(path) in str(error.value)
+def test_the_platform_follows_the_waypoints_and_touches_nothing(name):
+    made, body, sphere = stage(name)
+    rng, nearest, driven = np.random.default_rng(0), np.inf, 0.0
+    for _ in range(6):
+        candidates = made.robot.candidates(sphere)
+        chosen = int(rng.integers(len(candidates)))
+        T = candidates.T_world_camera[chosen]
+        waypoints = made.robot.waypoints(T)
+        legs = np.diff([p.platform_world[:2] for p in waypoints], axis=0)
+        for one, other in pairwise(waypoints):
+            for posture in between(one, other):
+                body.place(posture)
+                nearest = min(nearest, clearance(body))
+        length = float(np.linalg.norm(legs, axis=1).sum())
+        assert length == pytest.approx(candidates.path_length[chosen], abs=1e-9)
+        assert made.robot.move_to(T) == pytest.approx(length, abs=1e-9)
+        driven += length
+    assert nearest > 0.0
+    assert driven > 2.0
+
+
+def test_its_camera_sees_nothing_of_it_from_any_view_of_the_sphere():
+    made, _, sphere = stage("clutter")
+    candidates = made.robot.candidates(sphere)
+    solved = [made.robot.solve(T) for T in candidates.T_world_camera[::40]]
+    extremes = [np.argmin([p.head_pitch for p in solved]), np.argmax([abs(p.head_yaw) for p in solved])]
+    floating = replace_body(made.camera)
+    for index in {*extremes, *range(0, len(solved), 40)}:
+        T = candidates.T_world_camera[40 * int(index)]
+        with_body, without = made.camera.capture(T), floating.capture(T)
+        np.testing.assert_array_equal(with_body.depth, without.depth)
+        np.testing.assert_array_equal(with_body.rgb, without.rgb)
+
+
+def replace_body(camera):
+    """The same camera without a body."""
+    floating = camera.fork()
+    floating._around = None
+    return floating
+
+
+def test_its_camera_sees_the_platform_straight_down():
+    """From 1.5 m the top of the platform, 0.3 m high, is 1.2 m deep, that of the mast 0.15 m."""
+    config = replace(FEW_PIXELS, robot=RobotConfig(pitch=(-90.0, 20.0)))
+    made, _, _ = stage("clutter", config)
+    T = transforms.look_at((-1.5, 0.0, 1.5), (-1.499, 0.0, 0.0))
+    view, floor = made.camera.capture(T), replace_body(made.camera).capture(T)
+    seen = view.depth != floor.depth
+    assert 0.1 < seen.mean() < 0.9
+    assert np.median(view.depth[seen]) == pytest.approx(1.2, abs=2e-3)
+    assert view.depth[seen].min() == pytest.approx(0.15, abs=0.01)
+    assert (view.labels[seen] == 0).all()
+    unreachable = transforms.look_at((0.0, 0.0, 2.5), (0.001, 0.0, 0.0))
+    plain = replace_body(made.camera).capture(unreachable)
+    np.testing.assert_array_equal(made.camera.capture(unreachable).depth, plain.depth)
