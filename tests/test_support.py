@@ -223,7 +223,7 @@ class TestInfer:
         graph = infer(tower(), CONFIG)
         assert all(s.certain and s.occurrences == s.opportunities == 1 for s in graph.supports)
         assert {k.probability for k in (*graph.objects, *graph.supports)} == {1.0}
-        assert {s.probability for s in infer(tower(), PAPER).supports} == {None}
+        assert {s.probability for s in infer_by_area(tower(), PAPER).supports} == {None}
         assert [o.id for o in graph.objects] == ["o0", "o1", "o2", "o3", "o4"]
         assert {k for k, s in graph.stability.items() if s.stable} == {"o1", "o2", "o3", "o4"}
         for support in graph.supports:
