@@ -20,7 +20,7 @@ from caryatid.errors import CaryatidError, InputError, PlanningError
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.io.images import png
-from caryatid.io.log import BusyError
+from caryatid.io.staging import BusyError
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
 from caryatid.sessions import Capture, Session

@@ -13,7 +13,7 @@ from synthetic import simulated_scene
 
 from caryatid.config import Config, RobotConfig
 from caryatid.geometry import transforms
-from caryatid.planning.posture import Posture
+from caryatid.planning.candidates import Posture
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation.scenes import DESIGNED
 from caryatid.simulation.setup import HumanoidBody, make_simulation

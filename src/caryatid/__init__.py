@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from caryatid.runtime import imported_late
-from caryatid.runtime.display import hooks
+from caryatid.runtime import hooks, imported_late
 
 if TYPE_CHECKING:
     from caryatid.config import Config

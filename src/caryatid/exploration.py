@@ -24,7 +24,7 @@ from caryatid.planning.planners.hidden_surface import SupportPlanner
 from caryatid.robots import Posture, Robot, Unreachable, view_sphere_of, way_to
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.protocol import straight_lengths
-from caryatid.runtime.display import Pictured
+from caryatid.runtime import Pictured
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.scene import Scene, Stopwatch
 from caryatid.sensing.view_sphere import ViewSphere

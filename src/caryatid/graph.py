@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from caryatid.geometry.shapes import Shape, Uncertainty
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.display import Pictured
+from caryatid.runtime import Pictured
 
 if TYPE_CHECKING:
     import networkx as nx

@@ -39,7 +39,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import read_mask
 from caryatid.io.json_files import Numbers
-from caryatid.io.log import BusyError
+from caryatid.io.staging import BusyError
 from caryatid.manipulation.order import plan_order
 from caryatid.runtime.parallel import cores
 from caryatid.sessions import Capture, Session

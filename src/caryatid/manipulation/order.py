@@ -35,7 +35,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import LIKELY, Grasp, SupportGraph, TakeStep
 from caryatid.manipulation.grasps import Blocked, find_grasp
 from caryatid.robots.arm import Reachable
-from caryatid.runtime.display import Pictured
+from caryatid.runtime import Pictured
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.simulation.lifting import ASIDE, Lift, Lifting
 from caryatid.simulation.world import TABLE, Body, add_body, empty_spec, quaternion, strayed

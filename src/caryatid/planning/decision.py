@@ -16,10 +16,9 @@ from caryatid.errors import PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.planning.candidates import Candidates, Looks
+from caryatid.planning.candidates import Candidates, Looks, Posture
 from caryatid.planning.points_of_interest import PointOfInterest
-from caryatid.planning.posture import Posture
-from caryatid.runtime.display import Pictured
+from caryatid.runtime import Pictured
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.voxel_map import VoxelMap

@@ -13,7 +13,7 @@ import numpy as np
 from caryatid.config import Config, RobotConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.geometry.transforms import Array, rigid, rotation_from_vector
-from caryatid.planning.posture import Posture
+from caryatid.planning.candidates import Posture
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot

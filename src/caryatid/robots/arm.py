@@ -13,8 +13,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.geometry.transforms import Array
-from caryatid.planning.candidates import Candidates
-from caryatid.planning.posture import Posture
+from caryatid.planning.candidates import Candidates, Posture
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.protocol import (
     OwnViews,

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from caryatid.errors import PlanningError
 from caryatid.geometry.transforms import Array
-from caryatid.planning.candidates import Candidates
-from caryatid.planning.posture import Posture
+from caryatid.planning.candidates import Candidates, Posture
 from caryatid.sensing.view_sphere import ViewSphere
 
 

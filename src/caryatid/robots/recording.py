@@ -10,8 +10,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io.datasets import Dataset
-from caryatid.planning.candidates import Candidates
-from caryatid.planning.posture import Posture
+from caryatid.planning.candidates import Candidates, Posture
 from caryatid.robots.protocol import SimulatedRobot, Unreachable, posture_at, straight_lengths
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import View

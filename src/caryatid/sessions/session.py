@@ -43,8 +43,7 @@ from caryatid.graph import Change, SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.images import pack, png, read_mask, unpack
 from caryatid.io.json_files import Numbers, parse_json
-from caryatid.io.log import LATER, Log
-from caryatid.io.staging import read_errors, recover, sync, write_errors, write_file
+from caryatid.io.staging import LATER, Log, read_errors, recover, sync, write_errors, write_file
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, Surroundings, find_robot, view_sphere_of

@@ -9,7 +9,7 @@ import numpy as np
 
 from caryatid.config import Config, NoiseModel, RobotConfig
 from caryatid.geometry.transforms import Array
-from caryatid.planning.posture import Posture
+from caryatid.planning.candidates import Posture
 from caryatid.robots import HUMANOID, Robot, RobotMaker, Surroundings, find_robot, go_home
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot

@@ -23,7 +23,7 @@ VOLUMETRIC = (
 BUILT_IN: dict[str, tuple[str, ...]] = {
     "support": ("hidden_surface", "SupportPlanner"),
     "attention": ("saliency", "AttentionPlanner"),
-    "paper": ("paper", "PaperPlanner"),
+    "paper": ("saliency", "PaperPlanner"),
     "random": ("baselines", "RandomPlanner"),
     "ring": ("baselines", "RingPlanner"),
     "farthest": ("baselines", "FarthestPlanner"),
