@@ -27,10 +27,11 @@ from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.expected_visibility import (
     SPACE,
+    predict_goal,
+    settled,
     surface_samples,
     visibility,
 )
-from caryatid.planning.goals import predict_goal, settled
 from caryatid.planning.planners import BUILT_IN, VOLUMETRIC, make_planner
 from caryatid.planning.planners.baselines import STOPS, RandomPlanner
 from caryatid.planning.planners.volumetric import ray_information

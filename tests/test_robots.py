@@ -23,7 +23,7 @@ from caryatid.robots.reachability import sample_reachability, write_reachability
 from caryatid.robots.recording import RecordingRobot
 from caryatid.sensing.view_sphere import ViewSphere, direction
 from caryatid.sessions import Session
-from caryatid.sessions.next_view import table_floor
+from caryatid.sessions.session import table_floor
 
 CONFIG = RobotConfig()
 UP = (0.0, 0.0, 1.0)

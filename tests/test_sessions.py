@@ -25,7 +25,7 @@ from caryatid.scene import Scene
 from caryatid.sensing.views import View
 from caryatid.sessions import Capture, Session
 from caryatid.sessions import session as session_module
-from caryatid.sessions.captures import CameraRecord
+from caryatid.sessions.messages import CameraRecord
 from caryatid.sessions.session import SessionConflictError, _Unpickler
 
 LOG = "session.jsonl"

@@ -18,7 +18,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import Change, SupportGraph, TakeStep
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, Planner, PlanningState, check_candidates, path_cost
-from caryatid.planning.goals import predict_goal, settled
+from caryatid.planning.expected_visibility import predict_goal, settled
 from caryatid.planning.planners import make_planner
 from caryatid.planning.planners.hidden_surface import SupportPlanner
 from caryatid.robots import Posture, Robot, Unreachable, view_sphere_of, way_to

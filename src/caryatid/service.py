@@ -43,8 +43,7 @@ from caryatid.io.staging import BusyError
 from caryatid.manipulation.order import plan_order
 from caryatid.runtime.parallel import cores
 from caryatid.sessions import Capture, Session
-from caryatid.sessions.captures import CameraRecord
-from caryatid.sessions.next_view import CandidateViews
+from caryatid.sessions.messages import CameraRecord, CandidateViews
 from caryatid.sessions.session import SessionConflictError, is_session
 from caryatid.support.relations import Effect
 

@@ -26,7 +26,7 @@ from caryatid.robots.protocol import refusal_of
 from caryatid.runtime.parallel import cores
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
-from caryatid.sessions.next_view import reached_candidates, table_floor
+from caryatid.sessions.session import reached_candidates, table_floor
 from caryatid_ros import messages
 from caryatid_ros.messages import Make
 

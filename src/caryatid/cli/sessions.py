@@ -16,8 +16,7 @@ from caryatid.io.json_files import parse_json, read_json
 from caryatid.io.staging import write_errors
 from caryatid.robots import located
 from caryatid.sessions import Capture, Session
-from caryatid.sessions.next_view import CandidateViews
-from caryatid.sessions.session import Moved
+from caryatid.sessions.messages import CandidateViews, Moved
 from caryatid.viz.tables import census, count_of
 
 KEPT = "all views and changes saved so far are kept"

@@ -35,24 +35,30 @@ from caryatid.exploration import (
     Step,
     given_candidates,
     next_best_view,
+    reachable_views,
     reason_to_stop,
     used_up,
 )
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array, as_rigid
-from caryatid.graph import Change, SupportGraph
-from caryatid.io.graph_json import graph_text, graph_to_json
+from caryatid.graph import SupportGraph
+from caryatid.io.graph_json import graph_text
 from caryatid.io.images import pack, png, read_mask, unpack
 from caryatid.io.json_files import Numbers, parse_json
 from caryatid.io.staging import LATER, Log, read_errors, recover, sync, write_errors, write_file
+from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner
-from caryatid.robots import HUMANOID, Surroundings, find_robot, view_sphere_of
+from caryatid.robots import HUMANOID, Robot, Surroundings, find_robot, view_sphere_of
+from caryatid.robots.floor import STEP, FloorGrid
+from caryatid.robots.protocol import straight_lengths
 from caryatid.runtime import fingerprint
 from caryatid.scene import KEPT, Scene
 from caryatid.segmentation.view_checks import described
+from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import View
-from caryatid.sessions.captures import Capture
-from caryatid.sessions.next_view import REFUSED, NextView, reached_candidates, table_floor
+from caryatid.sessions.messages import Added, Capture, NextView
 
 SESSION_FILE: Final = "session.jsonl"
 """Name of the log."""
@@ -64,6 +70,8 @@ RESTORE: Final = "restore this file, or delete this view and all later lines fro
 """Remedy for a damaged view."""
 ANOTHER_RELEASE: Final = "open it with that release, or add its views to a new session"
 """Remedy for a session of another release."""
+REFUSED = "the robot cannot go there"
+"""Reason to reject a view that a client refuses."""
 
 KNOWN: Final = {
     ("builtins", "set"),
@@ -124,45 +132,6 @@ class Beginning:
             by = f"created by caryatid {line.get('caryatid')}"
             reason = f"{by}, incompatible with this release ({error.reason})"
             raise InputError(path, reason, ANOTHER_RELEASE) from None
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Added:
-    """Result of adding a view.
-
-    Attributes:
-        number: Number of the view, from 0.
-        graph: The fused support graph with it.
-        changed: Whether it changed the graph.
-        T_world_camera: Registered camera pose (4, 4), or None while the view waits.
-        warnings: What may be wrong with the view, or why it waits; one sentence each.
-        changes: Changes of objects since the previous view, seen or reported.
-    """
-
-    number: int
-    graph: SupportGraph
-    changed: bool
-    T_world_camera: Array | None = None
-    warnings: tuple[str, ...] = ()
-    changes: tuple[Change, ...] = ()
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the answer of `caryatid session add` and of the service."""
-        pose = None if self.T_world_camera is None else self.T_world_camera.tolist()
-        document = {"view": self.number, "changed": self.changed, "T_world_camera": pose}
-        known = {"warnings": list(self.warnings), "changes": [asdict(change) for change in self.changes]}
-        return document | known | {"graph": graph_to_json(self.graph)}
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Moved:
-    """moved.json: the motion of an object.
-
-    Attributes:
-        T: Rigid transform (4, 4) in the world frame [m].
-    """
-
-    T: Annotated[Array, Numbers(4, 4, rigid=True)]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -572,6 +541,31 @@ class Session:
         """File of the scene after these events, named by them and the code that made it."""
         made_of = " ".join((fingerprint(), repr(self.beginning), *map(_told, events)))
         return self.path / "state" / f"{hashlib.sha256(made_of.encode()).hexdigest()}.pickle"
+
+
+def table_floor(scene: Scene) -> FloorGrid:
+    """The floor around the table of a scene; the area under the table top is blocked."""
+    assert scene.surface is not None
+    assert scene.sphere is not None
+    shape = scene.surface.shape
+    top = float(scene.surface.point_world[2])
+    T_world_box = transforms.rigid(shape.T_world_object[:3, :3], (*shape.T_world_object[:2, 3], top / 2.0))
+    extents = np.array([*shape.extents[:2], max(abs(top), 2.0 * STEP)])
+    box = Box(T_world_box, extents)
+    return FloorGrid.from_boxes([box], scene.config.robot, scene.sphere.centre_world[:2])
+
+
+def reached_candidates(robot: Robot, T_world_camera: Array, sphere: ViewSphere) -> Candidates:
+    """Views that a robot can reach from its camera pose (4, 4), with or without its roll.
+
+    If the robot cannot hold that pose, paths are straight lines.
+    """
+    for T in (T_world_camera, transforms.look_at(T_world_camera[:3, 3], sphere.centre_world)):
+        with suppress(PlanningError):
+            robot.move_to(T)
+            return reachable_views(robot, sphere)
+    found = reachable_views(robot, sphere)
+    return found.from_elsewhere(straight_lengths(T_world_camera, found.T_world_camera))
 
 
 def _told(event: Event) -> str:

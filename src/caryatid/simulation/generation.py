@@ -107,7 +107,17 @@ def generate(
 def _dense(rng: np.random.Generator, size: int) -> _Plan:
     """Three in ten objects of the heap are dropped in a random orientation, the others upright."""
     radius = 0.12 * max(1.0, np.sqrt(size / 16))
-    screens = _screens(rng)
+    # Two to four thin boxes, taller than most of the heap, with broad sides facing the middle.
+    around = int(rng.integers(2, 5))
+    step = 2.0 * np.pi / around
+    azimuths = rng.uniform(-np.pi, np.pi) + step * (np.arange(around) + rng.uniform(-0.2, 0.2, size=around))
+    screens = []
+    for azimuth in azimuths:
+        distance = rng.uniform(0.2, 0.27)
+        width, height = rng.uniform(0.12, 0.18), rng.uniform(0.23, 0.32)
+        at = (distance * np.cos(azimuth), distance * np.sin(azimuth), TABLE_HEIGHT + height / 2.0)
+        T = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, azimuth)), at)
+        screens.append(Body(Box(T, np.array([0.05, width, height])), density=1200.0))
     sides: tuple[Side, ...] = ("+x", "+y", "-y")
     count = int(rng.integers(1, 3))
     walls = tuple(sides[i] for i in sorted(rng.choice(3, size=count, replace=False)))
@@ -130,8 +140,11 @@ def _packed(rng: np.random.Generator, size: int) -> _Plan:
 
     def draw(scene: SimulatedScene | None) -> _Drop:
         shape = _upright(rng)
-        if rng.random() < 0.5:
-            shape = _turned(shape, turn)
+        if rng.random() < 0.5:  # turn its level axes to those of the pack
+            R = shape.T_world_object[:3, :3]
+            level = int(np.argmin(np.abs(R[2])))
+            back = transforms.rotation_from_vector((0.0, 0.0, -np.arctan2(R[1, level], R[0, level])))
+            shape = shape.moved(transforms.rigid(turn @ back, np.zeros(3)))
         if scene is None:
             return _let_go(shape, np.zeros(2), scene), False
         if rng.random() < 0.3:
@@ -371,49 +384,19 @@ def _shape(rng: np.random.Generator, R: Array) -> Shape:
     return Sphere(T, radius)
 
 
-def _screens(rng: np.random.Generator) -> list[Body]:
-    """Two to four thin boxes around a heap, taller than most of it, with broad sides facing the middle."""
-    count = int(rng.integers(2, 5))
-    step = 2.0 * np.pi / count
-    azimuths = rng.uniform(-np.pi, np.pi) + step * (np.arange(count) + rng.uniform(-0.2, 0.2, size=count))
-    screens = []
-    for azimuth in azimuths:
-        distance = rng.uniform(0.2, 0.27)
-        width, height = rng.uniform(0.12, 0.18), rng.uniform(0.23, 0.32)
-        at = (distance * np.cos(azimuth), distance * np.sin(azimuth), TABLE_HEIGHT + height / 2.0)
-        T = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, azimuth)), at)
-        screens.append(Body(Box(T, np.array([0.05, width, height])), density=1200.0))
-    return screens
-
-
-def _turned(shape: Shape, turn: Array) -> Shape:
-    """Turn a shape at the origin so that its level axes are those of the pack."""
-    R = shape.T_world_object[:3, :3]
-    level = int(np.argmin(np.abs(R[2])))
-    yaw = np.arctan2(R[1, level], R[0, level])
-    back = transforms.rotation_from_vector((0.0, 0.0, -yaw))
-    return shape.moved(transforms.rigid(turn @ back, np.zeros(3)))
-
-
 def _pushed(shape: Shape, outward_world: Array, others: Sequence[Shape]) -> Shape:
     """Push a shape over the table from outside towards the middle, until it is `CLOSE` to another one."""
     z = TABLE_HEIGHT + float(shape.support(np.array([[0.0, 0.0, -1.0]]))[0]) + CLOSE
     distance = float(np.hypot(*TABLE_SIZE))
     for _ in range(60):
         at = shape.moved(transforms.rigid(np.eye(3), distance * outward_world + (0.0, 0.0, z)))
-        gap = min(_gap(at, other) for other in others)
+        # From samples on both surfaces, 4 mm apart.
+        pairs = [pair for other in others for pair in ((at, other), (other, at))]
+        gap = min(float(a.signed_distance(b.surface(0.004)[0]).min()) for a, b in pairs)
         if gap < CLOSE or distance <= 0.0:
             break
         distance = max(distance - gap + CLOSE / 2.0, 0.0)
     return at
-
-
-def _gap(a: Shape, b: Shape) -> float:
-    """Distance [m] between two shapes, from samples on both surfaces 4 mm apart."""
-    return min(
-        float(a.signed_distance(b.surface(0.004)[0]).min()),
-        float(b.signed_distance(a.surface(0.004)[0]).min()),
-    )
 
 
 # Household objects, upright at the origin
@@ -429,21 +412,34 @@ Ring = tuple[float, float]
 
 def thing(rng: np.random.Generator) -> Shape:
     """Draw a tray, a bowl, a mug or the like; four in ten are hollow."""
-    makers: dict[Callable[[np.random.Generator], Shape], float] = {
-        tray: 0.1, bowl: 0.12, mug: 0.12, _open_box: 0.06, _plate: 0.14,
-        _book: 0.14, _carton: 0.08, _can: 0.08, bottle: 0.06, _fruit: 0.1,
+    kinds = {
+        "tray": 0.1, "bowl": 0.12, "mug": 0.12, "open box": 0.06, "plate": 0.14,
+        "book": 0.14, "carton": 0.08, "can": 0.08, "bottle": 0.06, "fruit": 0.1,
     }  # fmt: skip
-    shape = list(makers)[int(rng.choice(len(makers), p=list(makers.values())))](rng)
+    made = {"tray": tray, "bowl": bowl, "mug": mug, "bottle": bottle}
+    shape: Shape
+    match list(kinds)[int(rng.choice(len(kinds), p=list(kinds.values())))]:
+        case "open box":
+            shape = _hollow_box(*rng.uniform((0.11, 0.13, 0.07), (0.15, 0.2, 0.11)))
+        case "plate":
+            shape = Cylinder(np.eye(4), float(rng.uniform(0.085, 0.12)), 0.018)
+        case "book":
+            shape = Box(np.eye(4), rng.uniform((0.13, 0.18, 0.018), (0.17, 0.24, 0.045)))
+        case "carton":
+            shape = Box(np.eye(4), rng.uniform((0.06, 0.11, 0.16), (0.08, 0.14, 0.2)))
+        case "can":
+            shape = Cylinder(np.eye(4), float(rng.uniform(0.03, 0.04)), float(rng.uniform(0.09, 0.125)))
+        case "fruit":
+            half = rng.uniform(0.028, 0.042) * np.array([1.0, 0.95, 0.88])
+            shape = Solid.of([_hull(fibonacci_sphere(120) * half)])
+        case kind:
+            shape = made[kind](rng)
     return shape.moved(transforms.rigid(_yaw(rng), np.zeros(3)))
 
 
 def tray(rng: np.random.Generator) -> Solid:
     """Draw a tray with a low rim."""
     return _hollow_box(*rng.uniform((0.2, 0.26, 0.03), (0.27, 0.36, 0.06)))
-
-
-def _open_box(rng: np.random.Generator) -> Shape:
-    return _hollow_box(*rng.uniform((0.11, 0.13, 0.07), (0.15, 0.2, 0.11)))
 
 
 def _hollow_box(x: float, y: float, z: float) -> Solid:
@@ -465,12 +461,14 @@ def bowl(rng: np.random.Generator) -> Solid:
 def mug(rng: np.random.Generator) -> Solid:
     """Draw a straight wall, a floor, and a handle of three bars."""
     radius, height = float(rng.uniform(0.036, 0.046)), float(rng.uniform(0.075, 0.1))
-    bars = [
-        _bar((radius + 0.01, 0.0, 0.25 * height), (0.024, 0.01, 0.01)),
-        _bar((radius + 0.01, 0.0, 0.75 * height), (0.024, 0.01, 0.01)),
-        _bar((radius + 0.025, 0.0, 0.5 * height), (0.01, 0.01, 0.5 * height + 0.01)),
-    ]
-    return Solid.of([*_wall((radius, 0.0), (radius, height)), _disc(radius), *bars])
+    corners = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / 2.0
+    bars = (
+        ((radius + 0.01, 0.0, 0.25 * height), (0.024, 0.01, 0.01)),
+        ((radius + 0.01, 0.0, 0.75 * height), (0.024, 0.01, 0.01)),
+        ((radius + 0.025, 0.0, 0.5 * height), (0.01, 0.01, 0.5 * height + 0.01)),
+    )
+    handle = [_hull(centre + corners * extents) for centre, extents in bars]
+    return Solid.of([*_wall((radius, 0.0), (radius, height)), _disc(radius), *handle])
 
 
 def bottle(rng: np.random.Generator) -> Solid:
@@ -478,27 +476,6 @@ def bottle(rng: np.random.Generator) -> Solid:
     radius, height = float(rng.uniform(0.03, 0.04)), float(rng.uniform(0.17, 0.24))
     rings = [(radius, 0.0), (radius, 0.6 * height), (0.013, 0.78 * height), (0.013, height)]
     return Solid.of([_hull([*_ring(a), *_ring(b)]) for a, b in pairwise(rings)])
-
-
-def _fruit(rng: np.random.Generator) -> Shape:
-    half = rng.uniform(0.028, 0.042) * np.array([1.0, 0.95, 0.88])
-    return Solid.of([_hull(fibonacci_sphere(120) * half)])
-
-
-def _plate(rng: np.random.Generator) -> Shape:
-    return Cylinder(np.eye(4), float(rng.uniform(0.085, 0.12)), 0.018)
-
-
-def _can(rng: np.random.Generator) -> Shape:
-    return Cylinder(np.eye(4), float(rng.uniform(0.03, 0.04)), float(rng.uniform(0.09, 0.125)))
-
-
-def _book(rng: np.random.Generator) -> Shape:
-    return Box(np.eye(4), rng.uniform((0.13, 0.18, 0.018), (0.17, 0.24, 0.045)))
-
-
-def _carton(rng: np.random.Generator) -> Shape:
-    return Box(np.eye(4), rng.uniform((0.06, 0.11, 0.16), (0.08, 0.14, 0.2)))
 
 
 def _wall(low: Ring, high: Ring) -> list[Polytope]:
@@ -511,11 +488,6 @@ def _wall(low: Ring, high: Ring) -> list[Polytope]:
 def _disc(radius: float) -> Polytope:
     """The floor of a round object."""
     return _hull([*_ring((radius - WALL / 2.0, 0.0)), *_ring((radius - WALL / 2.0, WALL))])
-
-
-def _bar(centre: Sequence[float], size: Sequence[float]) -> Polytope:
-    corners = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / 2.0
-    return _hull(centre + corners * size)
 
 
 def _ring(ring: Ring) -> Array:

@@ -23,6 +23,7 @@ from caryatid.planning.expected_visibility import (
     SPACE,
     Samples,
     join,
+    matter,
     newly_visible,
     relation_samples,
     space_samples,
@@ -30,7 +31,6 @@ from caryatid.planning.expected_visibility import (
     unseen_shares,
     visibility,
 )
-from caryatid.planning.goals import matter
 from caryatid.planning.points_of_interest import (
     PointOfInterest,
     inhibition_of_return,

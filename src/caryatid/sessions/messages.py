@@ -1,9 +1,9 @@
-"""A view as received: encoded images and their camera."""
+"""What clients of a session send, and what it answers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 from caryatid.config import SessionConfig
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
+from caryatid.graph import Change, SupportGraph
+from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import DEPTH_MODES, MASK_MODES, decode_image, read_npy
 from caryatid.io.json_files import Numbers, parse_json, read_json
 from caryatid.io.staging import read_errors
+from caryatid.planning.decision import Decision
 from caryatid.sensing.views import View
 
 _FILES: Final = {
@@ -108,3 +111,97 @@ def _read(path: Path, max_bytes: float) -> bytes:
         if path.stat().st_size > max_bytes:
             raise InputError(path, f"is larger than {max_bytes} bytes", "give a smaller file")
         return path.read_bytes()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Moved:
+    """moved.json: the motion of an object.
+
+    Attributes:
+        T: Rigid transform (4, 4) in the world frame [m].
+    """
+
+    T: Annotated[Array, Numbers(4, 4, rigid=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateViews:
+    """Views that a robot can reach, or cannot: candidates.json.
+
+    Attributes:
+        T_world_camera: Camera poses (N, 4, 4) [m] to choose from; OpenCV camera frame, world z up. Null for
+            those that the session's robot reaches.
+        path_length: Path length (N,) [m] to each, or null for straight lines.
+        refused: Camera poses (M, 4, 4) [m] to which the robot cannot go after all, or null for none.
+    """
+
+    T_world_camera: Annotated[Array, Numbers(-1, 4, 4)] | None = None
+    path_length: Annotated[Array, Numbers(-1)] | None = None
+    refused: Annotated[Array, Numbers(-1, 4, 4)] | None = None
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `Session.next`."""
+        refused = () if self.refused is None else self.refused
+        return {"candidates": self.T_world_camera, "path_length": self.path_length, "refused": refused}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Added:
+    """Result of adding a view.
+
+    Attributes:
+        number: Number of the view, from 0.
+        graph: The fused support graph with it.
+        changed: Whether it changed the graph.
+        T_world_camera: Registered camera pose (4, 4), or None while the view waits.
+        warnings: What may be wrong with the view, or why it waits; one sentence each.
+        changes: Changes of objects since the previous view, seen or reported.
+    """
+
+    number: int
+    graph: SupportGraph
+    changed: bool
+    T_world_camera: Array | None = None
+    warnings: tuple[str, ...] = ()
+    changes: tuple[Change, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the answer of `caryatid session add` and of the service."""
+        pose = None if self.T_world_camera is None else self.T_world_camera.tolist()
+        document = {"view": self.number, "changed": self.changed, "T_world_camera": pose}
+        known = {"warnings": list(self.warnings), "changes": [asdict(change) for change in self.changes]}
+        return document | known | {"graph": graph_to_json(self.graph)}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class NextView:
+    """The next best view.
+
+    Attributes:
+        number: Number of the next view, from 0.
+        decision: Pose, waypoints (none with given candidates), expected gain, cost and reason.
+        stop: Why another view may not be worth its path, or None.
+    """
+
+    number: int
+    decision: Decision
+    stop: str | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the answer of `caryatid session next` and of the service."""
+        d = self.decision
+        waypoints = [posture.to_json() for posture in d.waypoints]
+        there = waypoints[-1] if waypoints else dict.fromkeys(("platform", "camera_height", "gaze", "joints"))
+        return {
+            "view": self.number,
+            "T_world_camera": d.T_world_camera.tolist(),
+            "candidate": d.index,
+            **there,
+            "waypoints": waypoints,
+            "expected_gain": d.saliency,
+            "cost": d.cost,
+            "score": d.score,
+            "why": d.why,
+            "stop": self.stop,
+        }
