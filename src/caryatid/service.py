@@ -55,10 +55,8 @@ PATIENCE = 30.0
 """Maximum time for a request's body to arrive [s]: 16 MB at half a megabyte per second."""
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", description="Name of the session")]
-Settings = Annotated[
-    dict[str, dict[str, Any]],
-    Field(description="Settings to change, as in `caryatid config --json`: stage → name → value"),
-]
+_SETTINGS = Field(description="Settings to change, as in `caryatid config --json`: stage → name → value")
+Settings = Annotated[dict[str, dict[str, Any]], _SETTINGS]
 
 
 class Document(BaseModel):
@@ -94,13 +92,6 @@ class NewView(Document):
     """Grey PNG, or .npy (H, W) of integers: the object of each pixel, 0 = no object."""
     number: int | None = Field(None, ge=0)
     """Number of the view, from 0; makes retries safe: the last view is not added twice."""
-
-    def capture(self) -> Capture:
-        """The view, its images not decoded yet."""
-        images = {"depth": self.depth, "rgb": self.rgb, "labels": self.labels}
-        name = "view" if self.number is None else f"view {self.number + 1}"
-        given = {key: content for key, content in images.items() if content is not None}
-        return Capture(given, replace(self.camera, name=name))
 
 
 class NewReport(Document):
@@ -175,15 +166,15 @@ def check_limits(own: Config, asked: Config) -> None:
     Raises:
         InputError: The error names the setting.
     """
+    remedy = "change it in the settings of the service"
     for stage, values in asdict(asked).items():
         for name, value in values.items():
-            before, reason = getattr(getattr(own, stage), name), None
-            if stage == "session" or name in ("max_voxels", "max_pixels"):
-                reason = "is a limit of the service"
-            elif _is_far(value, before):
+            before = getattr(getattr(own, stage), name)
+            if value != before and (stage == "session" or name in ("max_voxels", "max_pixels")):
+                raise InputError(f"{stage}.{name}", "is a limit of the service", remedy)
+            if _is_far(value, before):
                 reason = f"differs from this service's {before} by more than a factor of ten"
-            if value != before and reason is not None:
-                raise InputError(f"{stage}.{name}", reason, "change it in the settings of the service")
+                raise InputError(f"{stage}.{name}", reason, remedy)
 
 
 def _is_far(value: ArrayLike, before: ArrayLike) -> bool:
@@ -249,9 +240,8 @@ def make_app(
 
 
 def _add_pages(app: FastAPI, pool: SessionPool) -> None:
-    def state(session: Session) -> dict[str, Any]:
-        graph = graph_to_json(session.graph)
-        return {"views": session.views, "reports": session.reports, "graph": graph}
+    def counts(session: Session) -> dict[str, Any]:
+        return {"views": session.views, "reports": session.reports}
 
     @app.get("/sessions")
     def list_sessions() -> dict[str, list[str]]:
@@ -263,7 +253,7 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         """Return the options of a session, and its numbers of views and reports."""
         session = pool.session(name)
         options = {key: getattr(session.beginning, key) for key in ("segmentation", "seed", "planner")}
-        return {"name": name} | options | {"views": session.views, "reports": session.reports}
+        return {"name": name} | options | counts(session)
 
     @app.post("/sessions", status_code=201)
     def begin_session(given: NewSession) -> dict[str, Any]:
@@ -279,22 +269,25 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     def add_view(name: Name, given: NewView) -> dict[str, Any]:
         """Add a view; once this returns, the view is safe on disk."""
         pool.check_room()
-        return pool.session(name).add(given.capture(), given.number).to_json()
+        camera = replace(given.camera, name="view" if given.number is None else f"view {given.number + 1}")
+        images = {"depth": given.depth, "rgb": given.rgb, "labels": given.labels}
+        known = {key: content for key, content in images.items() if content is not None}
+        return pool.session(name).add(Capture(known, camera), given.number).to_json()
 
     @app.post("/sessions/{name}/reports", status_code=201)
     def report_change(name: Name, given: NewReport) -> dict[str, Any]:
         """Report an object that was removed or moved; once this returns, the report is safe on disk."""
         pool.check_room()
         session = pool.session(name)
-        session.take(given.object, given.T, given.number)
-        return state(session)
+        graph = session.take(given.object, given.T, given.number)
+        return counts(session) | {"graph": graph_to_json(graph)}
 
     @app.delete("/sessions/{name}/views/last")
     def undo_view(name: Name) -> dict[str, Any]:
         """Undo the last view, or the last report after it."""
         session = pool.session(name)
         session.undo()
-        return state(session)
+        return counts(session) | {"graph": graph_to_json(session.graph)}
 
     @app.get("/sessions/{name}/graph")
     def get_graph(name: Name) -> dict[str, Any]:
@@ -317,11 +310,8 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         scene = pool.session(name).scene
         config = changed_settings(scene.config, given.settings, "settings")
         check_limits(pool.config, config)
-        asked = given.model_dump(include={"goal", "hands"})
-        order = plan_order(
-            scene.graph, config, **asked, seed=scene.seed, threads=cores(), voxels=scene.voxels
-        )
-        return order.to_json()
+        known: dict[str, Any] = {"seed": scene.seed, "threads": cores(), "voxels": scene.voxels}
+        return plan_order(scene.graph, config, goal=given.goal, hands=given.hands, **known).to_json()
 
     @app.get("/sessions/{name}/effects/{object_id}")
     def predict_removal(name: Name, object_id: str) -> list[Effect]:

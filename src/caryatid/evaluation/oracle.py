@@ -174,15 +174,10 @@ def planner_for(
 
 
 def spread_out(directions: Array, visited: Array, count: int) -> NDArray[np.intp]:
-    """Pick directions one by one, each as far as possible from the visited and the picked ones.
+    """Pick up to `count` directions (N, 3) one by one, each as far as possible from the earlier ones.
 
-    Args:
-        directions: Unit vectors (N, 3) to pick from.
-        visited: Unit vectors (V, 3), V ≥ 1.
-        count: Maximum number to pick.
-
-    Returns:
-        Indices (M,), M = min(count, N), each once; the first of equally far ones.
+    These are the visited ones (V, 3), V ≥ 1, and the picked ones. Return indices (M,), each once; the first
+    of equally far ones.
     """
     nearness = (directions @ visited.T).max(axis=1)
     picked = []

@@ -193,14 +193,9 @@ def relevant(graph: SupportGraph, goal: str) -> set[str]:
 
 
 def matter(samples: Samples, graph: SupportGraph, goal: str | None) -> NDArray[np.bool_]:
-    """Whether each of the samples (K,) is about the goal's removal.
+    """Whether each of the samples (K,) is about the goal's removal; all are without a known goal.
 
     That is, about one of the relevant objects, or unseen space over the convex hull of their outlines.
-
-    Args:
-        samples: Points that views may show.
-        graph: The support graph.
-        goal: Id of the object to remove. Without one, or before it is known, all matter.
     """
     if not _knows(goal, graph):
         return np.ones(len(samples.weights), dtype=np.bool_)
@@ -214,14 +209,7 @@ def matter(samples: Samples, graph: SupportGraph, goal: str | None) -> NDArray[n
 def predict_goal(
     graph: SupportGraph, goal: str | None, voxels: VoxelMap, config: SupportConfig
 ) -> Removal | None:
-    """Say what moves when the goal is removed, or return None if no view has shown it.
-
-    Args:
-        graph: The support graph.
-        goal: Id of the object to remove, or None.
-        voxels: The voxel map.
-        config: The numbers the graph was inferred with.
-    """
+    """Say what moves when the goal is removed; None without a goal, or if no view has shown it."""
     if not _knows(goal, graph):
         return None
     samples = surface_samples(graph, voxels.occluders([o.shape for o in graph.objects]))
@@ -238,13 +226,7 @@ def settled(graph: SupportGraph, goal: str | None, until: float, removal: Remova
 
     Without a goal, this is the existence of every support. With a goal, it is whether each object moves or
     stays when the goal is removed, and that nothing unseen rests on the goal: at least that share of its
-    free upper side lies next to seen space.
-
-    Args:
-        graph: The support graph.
-        goal: Id of the object to remove, or None.
-        until: The probability [1].
-        removal: What `predict_goal` says.
+    free upper side lies next to seen space. The removal is what `predict_goal` says.
     """
     if goal is None:
         return all(s.belief >= until for s in graph.supports)

@@ -43,13 +43,7 @@ class FloorGrid:
     def from_boxes(
         cls, furniture: Sequence[Box], config: RobotConfig, around_world: ArrayLike = (0.0, 0.0)
     ) -> FloorGrid:
-        """Build the grid around static furniture.
-
-        Args:
-            furniture: Boxes on the floor.
-            config: Footprint, cell, size of the floor and heights that matter.
-            around_world: Middle (2,) of the floor the robot may use, x and y [m].
-        """
+        """Build the grid around static furniture; the middle (2,) of the usable floor is given [m]."""
         origin = np.asarray(around_world, dtype=np.float64)[:2] - config.floor
         count = max(1, round(2.0 * config.floor / config.cell))
         x, y = (low + config.cell * (np.arange(count) + 0.5) for low in origin)
@@ -72,11 +66,7 @@ class FloorGrid:
     ) -> FloorGrid:
         """Build the grid from a map of obstacles (H, W), rows along y, such as a robot's own map.
 
-        Args:
-            occupied: Cells (H, W) with an obstacle.
-            origin_world: Corner (2,) of cell [0, 0], x and y [m].
-            cell: Edge of a cell [m].
-            config: Footprint. Heights are unknown, so no wall hides anything.
+        Its corner (2,) and cell are those of the attributes [m]. No wall hides anything: heights are unknown.
         """
         free = np.ones(occupied.shape, dtype=np.bool_)
         if occupied.any():

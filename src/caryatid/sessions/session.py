@@ -35,6 +35,7 @@ from caryatid.exploration import (
     Step,
     given_candidates,
     next_best_view,
+    planning_state,
     reachable_views,
     reason_to_stop,
     used_up,
@@ -48,7 +49,6 @@ from caryatid.io.images import pack, png, read_mask, unpack
 from caryatid.io.json_files import Numbers, parse_json
 from caryatid.io.staging import LATER, Log, read_errors, recover, sync, write_errors, write_file
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, Robot, Surroundings, find_robot, view_sphere_of
 from caryatid.robots.floor import STEP, FloorGrid
@@ -405,10 +405,7 @@ class Session:
         visited = sphere.direction_of(T_world_cameras)
         planner = make_planner(self.beginning.planner)
         decision = next_best_view(self.scene, robot, visited, candidates=reachable, planner=planner)
-        assert self.scene.voxels is not None
-        state = PlanningState(
-            self.scene.graph, sphere, self.scene.voxels, visited, reachable, self.scene.config.active
-        )
+        state = planning_state(self.scene, sphere, visited, reachable)
         reports = [number for number, event in enumerate(self._events, start=1) if event.kind == "report"]
         stop = used_up(len(self._events) - max(reports, default=0), state.config)
         stop = stop or reason_to_stop(state, self.scene.changed, planner, decision)

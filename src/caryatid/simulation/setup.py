@@ -95,12 +95,7 @@ def make_simulation(
 ) -> Simulation:
     """Put a robot at its home view in front of the table, with the furniture on its floor map.
 
-    Args:
-        scene: The scene in physics.
-        config: Robot, sensor, noise and view sphere.
-        noise: Noise of the camera.
-        seed: Seed of the noise.
-        robot: Makes the robot, or its name for `find_robot`.
+    The robot is a maker, or a name for `find_robot`; the seed is that of the camera's noise.
 
     Raises:
         InputError: There is no robot of this name.

@@ -54,16 +54,12 @@ class GroundTruth:
 
 
 def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> GroundTruth:
-    """Derive the support graph from physics.
+    """Derive the support graph from the physics of a settled scene, whose state does not change.
 
     A supports B `bottom-up` if the upward part of the mean contact force of A on B exceeds 3 % of B's weight.
     Each object A is then removed for a second. A also supports an object B in contact with it that moves by
     more than 1 cm or 8° without it: `top-down` if A presses on B, `lean` if the force between them is mostly
     horizontal.
-
-    Args:
-        scene: A settled scene; its state does not change.
-        config: The thresholds.
     """
     config = config or PhysicsConfig()
     names = {0: scene.table, **scene.object_bodies}

@@ -235,14 +235,7 @@ class Body:
 
 
 def box(size: Vector, at: Vector, turn: Vector = (0.0, 0.0, 0.0), **matter: float) -> Body:
-    """A cuboid.
-
-    Args:
-        size: Full edge lengths [m].
-        at: Centre in x and y, and the height of the centre over the table top in z [m].
-        turn: Rotation vector [deg].
-        **matter: Density and friction of a `Body`.
-    """
+    """A cuboid of a size [m], with its centre in x, y and, over the table top, z [m]; turned [deg]."""
     return Body(Box(_placed(at, turn), np.array(size)), **matter)
 
 
@@ -272,17 +265,7 @@ def build_spec(
     table_size: tuple[float, float] = TABLE_SIZE,
     walls: Sequence[Side] = (),
 ) -> Any:
-    """Build a floor, a table with legs, walls beside it and free bodies `object0`, `object1`, … on it.
-
-    Args:
-        bodies: The free bodies, in order.
-        name: Name of the model.
-        table_size: Depth along x and width along y of the top [m].
-        walls: Sides of the table where a wall stands.
-
-    Returns:
-        The `mujoco.MjSpec`.
-    """
+    """Build the `MjSpec` of a floor, a table, walls beside it, and bodies `object0`, `object1`, … on it."""
     spec = empty_spec(name)
     spec.worldbody.add_geom(name="floor", type=_GEOM.mjGEOM_PLANE, size=[10.0, 10.0, 0.1])
     table = spec.worldbody.add_body(name=TABLE)
@@ -333,14 +316,7 @@ def _placed(at: Vector, turn: Vector = (0.0, 0.0, 0.0)) -> Array:
 def add_body(
     spec: Any, name: str, body: Body, rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
 ) -> None:
-    """Add a free body to a MuJoCo spec: a geom for each convex part, those of a solid as meshes.
-
-    Args:
-        spec: `mujoco.MjSpec`, changed in place.
-        name: Name of the body.
-        body: Its shape, pose and matter.
-        rgba: Its colour.
-    """
+    """Add a free body to a `mujoco.MjSpec`: a geom for each convex part, those of a solid as meshes."""
     shape = body.shape
     T_world_body = shape.T_world_object
     added = spec.worldbody.add_body(name=name, pos=T_world_body[:3, 3], quat=quaternion(T_world_body[:3, :3]))
@@ -398,20 +374,18 @@ def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
 
 def true_shapes(scene: SimulatedScene) -> dict[int, Shape]:
     """Shape of every object by label: a box, a cylinder, a sphere, or a solid of its geoms."""
-    return {label: _true_shape(scene, label) for label in scene.object_bodies}
-
-
-def _true_shape(scene: SimulatedScene, label: int) -> Shape:
-    geoms = _solid_geoms(scene, label)
-    shape = _primitive(scene, geoms[0]) if len(geoms) == 1 else None
-    if shape is not None:
-        return shape
-    T_world_body = transforms.rigid(
-        scene.data.xmat[scene.body_id(label)].reshape(3, 3), scene.data.xpos[scene.body_id(label)]
-    )
-    T_body_world = transforms.invert(T_world_body)
-    parts = [Polytope.around(transforms.transform(T_body_world, _outline(scene, geom))) for geom in geoms]
-    return Solid(T_world_body, tuple(part for part in parts if part is not None))
+    shapes: dict[int, Shape] = {}
+    for label in scene.object_bodies:
+        geoms, body = _solid_geoms(scene, label), scene.body_id(label)
+        shape = _primitive(scene, geoms[0]) if len(geoms) == 1 else None
+        if shape is None:
+            T_world_body = transforms.rigid(scene.data.xmat[body].reshape(3, 3), scene.data.xpos[body])
+            T_body_world = transforms.invert(T_world_body)
+            outlines = [transforms.transform(T_body_world, _outline(scene, geom)) for geom in geoms]
+            parts = tuple(part for part in map(Polytope.around, outlines) if part is not None)
+            shape = Solid(T_world_body, parts)
+        shapes[label] = shape
+    return shapes
 
 
 def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:

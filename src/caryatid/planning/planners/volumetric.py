@@ -110,15 +110,9 @@ def image_rays(config: ActiveVisionConfig) -> Array:
 
 
 def ray_information(voxels: VoxelMap, T_world_camera: Array, rays_camera: Array) -> Array:
-    """Sum the information the rays of each camera gather.
+    """Sum the information (C, 5) that the rays (R, 3), unit, of each camera (C, 4, 4) gather.
 
-    Args:
-        voxels: Where they gather it.
-        T_world_camera: Cameras (C, 4, 4).
-        rays_camera: Unit directions (R, 3) of the rays in the camera.
-
-    Returns:
-        (C, 5), one column per name of `VOLUMETRIC`: [bit] for entropies, [m] for `proximity-count`.
+    It has one column per name of `VOLUMETRIC`: [bit] for entropies, [m] for `proximity-count`.
     """
     occupancy, states = voxels.occupancy, np.ascontiguousarray(voxels.states)
     entropy = -occupancy * np.log2(occupancy) - (1.0 - occupancy) * np.log2(1.0 - occupancy)
