@@ -527,8 +527,9 @@ def next_best_view(
         candidates = reachable_views(robot, sphere)
     elif not isinstance(candidates, Candidates):
         candidates = given_candidates(candidates, path_length, poses[-1] if poses else None, sphere)
-    state = planning_state(scene, sphere, visited, candidates)
-    return _decide(state, robot, make_planner(planner), scene.seed)[0]
+    return _decide(
+        planning_state(scene, sphere, visited, candidates), robot, make_planner(planner), scene.seed
+    )[0]
 
 
 def reachable_views(robot: Robot, sphere: ViewSphere) -> Candidates:

@@ -310,8 +310,10 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         scene = pool.session(name).scene
         config = changed_settings(scene.config, given.settings, "settings")
         check_limits(pool.config, config)
-        known: dict[str, Any] = {"seed": scene.seed, "threads": cores(), "voxels": scene.voxels}
-        return plan_order(scene.graph, config, goal=given.goal, hands=given.hands, **known).to_json()
+        return plan_order(
+            scene.graph, config, goal=given.goal, hands=given.hands, seed=scene.seed, threads=cores(),
+            voxels=scene.voxels,
+        ).to_json()  # fmt: skip
 
     @app.get("/sessions/{name}/effects/{object_id}")
     def predict_removal(name: Name, object_id: str) -> list[Effect]:

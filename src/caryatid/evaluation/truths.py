@@ -67,7 +67,11 @@ def evaluate_run(
         InputError: The run or the truth is missing or broken, or they do not fit each other.
     """
     run = run_folder if isinstance(run_folder, Run) else read_run(run_folder)
-    source = str(_source_of(run) if truth is None else truth)
+    if truth is None:  # where the run's source lies from its folder, or else as typed
+        truth, path = run.record["source"], run.record.get("source_path")
+        place = (run.folder.resolve() / path).resolve() if path else None
+        truth = place if place is not None and place.exists() else truth
+    source = str(truth)
     folder = find_sample(source)
     if is_builtin(source) or (folder / SCENE_FILE).is_file() or folder.suffix == ".xml":
         scores = [
@@ -95,13 +99,6 @@ def evaluate_run(
             "%s: none of its objects matches one of %s; give the ground truth of this run", run.folder, source
         )
     return tuple(scores)
-
-
-def _source_of(run: Run) -> str | Path:
-    """The run's own source: where it lies from the run folder, or else as typed."""
-    typed, path = run.record["source"], run.record.get("source_path")
-    place = (run.folder.resolve() / path).resolve() if path else None
-    return place if place is not None and place.exists() else str(typed)
 
 
 def _truths(run: Run, scene: SimulatedScene) -> Iterator[TrueScene]:

@@ -107,8 +107,14 @@ class ArmRobot(SimulatedRobot, OwnViews):
         """
         centre = proposed.centre_world if self._centre is None else self._centre
         if self._sphere is None or not np.array_equal(self._sphere.centre_world, centre):
-            radius, count = self._radius_around(centre), self._config.sphere_points
-            self._sphere = self._sphere_around(centre, radius, count)
+            radius, largest = self._config.radius
+            if radius != largest:
+                # Thirteen spheres, 5 cm apart with the default radii.
+                radii = np.linspace(radius, largest, 13)
+                spheres = [self._sphere_around(centre, float(r), self._config.radius_views) for r in radii]
+                views = np.array([len(self._offered(sphere)) for sphere in spheres])
+                radius = float(radii[views >= RADIUS_SHARE * views.max()][-1])
+            self._sphere = self._sphere_around(centre, radius, self._config.sphere_points)
         return self._sphere
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
@@ -168,16 +174,6 @@ class ArmRobot(SimulatedRobot, OwnViews):
         posture = posture_at(T_world_camera, np.array([*self.T_world_base[:2, 3], base_yaw]))
         T_confirmed, joints = self._confirmed
         return replace(posture, joints=joints) if np.array_equal(T_confirmed, T_world_camera) else posture
-
-    def _radius_around(self, centre_world: Array) -> float:
-        smallest, largest = self._config.radius
-        if smallest == largest:
-            return smallest
-        # Thirteen spheres, 5 cm apart with the default radii.
-        radii = np.linspace(smallest, largest, 13)
-        spheres = [self._sphere_around(centre_world, float(r), self._config.radius_views) for r in radii]
-        views = np.array([len(self._offered(sphere)) for sphere in spheres])
-        return float(radii[views >= RADIUS_SHARE * views.max()][-1])
 
     def _sphere_around(self, centre_world: Array, radius: float, count: int) -> ViewSphere:
         return ViewSphere(centre_world, radius, transforms.rotate(self.T_world_base, fibonacci_sphere(count)))

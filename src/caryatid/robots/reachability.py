@@ -135,16 +135,7 @@ def sample_reachability(
     held = []
     for part in np.array_split(np.arange(count), min(10, count)):
         joints = rng.uniform(bounds[:, 0], bounds[:, 1], (len(part), len(bounds)))
-        T_base_camera = np.asarray(forward(joints), dtype=np.float64)
-        if T_base_camera.shape != (len(joints), 4, 4):
-            reason = f"returned shape {T_base_camera.shape} for {len(joints)} postures"
-            raise InputError("forward", reason, f"return ({len(joints)}, 4, 4)")
-        T_base_camera = T_base_camera[np.isfinite(T_base_camera).all(axis=(1, 2))]
-        R = T_base_camera[:, :3, :3]
-        skewed = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
-        skewed += 2.0 * (np.linalg.det(R) < 0.0)
-        if len(R):
-            transforms.as_rigid(T_base_camera[int(np.argmax(skewed))], "forward")
+        T_base_camera = _checked_poses(forward(joints), len(joints))
         cells = np.floor(T_base_camera[:, :3, 3] / config.cell).astype(np.intp)
         held.append(np.column_stack([cells, *bins.of(T_base_camera)]))
     places, early = np.concatenate(held), sum(map(len, held[:-1]))
@@ -233,3 +224,17 @@ class _Bins:
         y = np.einsum("ij,ij->i", right, self._down[nearest])
         eighth = np.floor(np.arctan2(y, x) * (8 / (2.0 * np.pi))).astype(np.intp) % 8
         return nearest, np.left_shift(1, eighth).astype(np.uint8)
+
+
+def _checked_poses(T_base_camera: ArrayLike, count: int) -> Array:
+    """Poses (M, 4, 4) of the possible postures."""
+    poses = np.asarray(T_base_camera, dtype=np.float64)
+    if poses.shape != (count, 4, 4):
+        reason = f"returned shape {poses.shape} for {count} postures"
+        raise InputError("forward", reason, f"return ({count}, 4, 4)")
+    poses = poses[np.isfinite(poses).all(axis=(1, 2))]
+    R = poses[:, :3, :3]
+    skewed = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) + 2.0 * (np.linalg.det(R) < 0.0)
+    if len(poses):
+        transforms.as_rigid(poses[int(np.argmax(skewed))], "forward")
+    return poses

@@ -74,7 +74,14 @@ class Capture:
         Raises:
             InputError: A file is missing or too large, or the camera is not valid.
         """
-        images = {key: _read(path, config.max_bytes) for key, path in files.items() if path is not None}
+        images = {}
+        for key, path in files.items():
+            if path is not None:
+                with read_errors(path, "give a readable file"):
+                    if path.stat().st_size > config.max_bytes:
+                        reason = f"is larger than {config.max_bytes} bytes"
+                        raise InputError(path, reason, "give a smaller file")
+                    images[key] = path.read_bytes()
         remedy = "give K (3×3) and, for all views after the first, T_world_camera (4×4, in metres)"
         given = parse_json(CameraRecord, read_json(camera, remedy), camera, remedy)
         return cls(images, replace(given, name=str(files["depth"])))
@@ -104,13 +111,6 @@ class Capture:
             reason = f"shape {array.shape} exceeds {max_pixels} pixels"
             raise InputError(name, reason, "give a smaller image, or raise recording.max_pixels")
         return np.ascontiguousarray(array)
-
-
-def _read(path: Path, max_bytes: float) -> bytes:
-    with read_errors(path, "give a readable file"):
-        if path.stat().st_size > max_bytes:
-            raise InputError(path, f"is larger than {max_bytes} bytes", "give a smaller file")
-        return path.read_bytes()
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -503,25 +503,21 @@ class Session:
 
     def _after(self, events: Sequence[Event]) -> Scene:
         """The scene after some events, from the newest usable snapshot and what came after it."""
-        b = self.beginning
-        done, scene = self._read_snapshot(events)
-        scene = scene or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
+        b, done = self.beginning, 0
+        scene = Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
+        for number in range(len(events), 0, -1):
+            # A damaged file may raise anything, and the events are still there.
+            with suppress(Exception):
+                content = gzip.decompress(self._snapshot(events[:number]).read_bytes())
+                found = _Unpickler(io.BytesIO(content)).load()
+                if isinstance(found, Scene):
+                    done, scene = number, found
+                    break
         for number, event in enumerate(events[done:], start=done + 1):
             self._apply(event, scene)
             if self._log.writable:
                 self._write_snapshot(scene, events[:number])
         return scene
-
-    def _read_snapshot(self, events: Sequence[Event]) -> tuple[int, Scene | None]:
-        """The newest snapshot that this code made of the first of these events, and their number."""
-        for number in range(len(events), 0, -1):
-            # A damaged file may raise anything, and the events are still there.
-            with suppress(Exception):
-                content = gzip.decompress(self._snapshot(events[:number]).read_bytes())
-                scene = _Unpickler(io.BytesIO(content)).load()
-                if isinstance(scene, Scene):
-                    return number, scene
-        return 0, None
 
     def _write_snapshot(self, scene: Scene, events: Sequence[Event]) -> None:
         """Keep the scene of all events, and of up to seven less, for undo; a failure costs only time."""
