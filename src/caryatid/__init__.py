@@ -23,36 +23,13 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
-hooks |= {
-    "notebook cell": "caryatid.viz.notebook:draw_cell",
-    "viewer": "caryatid.viewer:show",
-}
+hooks |= {"notebook cell": "caryatid.viz.notebook:draw_cell", "viewer": "caryatid.viewer:show"}
 
 __all__ = [
-    "Box",
-    "Camera",
-    "CaryatidError",
-    "Cloud",
-    "Config",
-    "Cylinder",
-    "Explorer",
-    "InputError",
-    "Planner",
-    "Robot",
-    "Scene",
-    "SceneObject",
-    "Session",
-    "Sphere",
-    "Step",
-    "Support",
-    "SupportGraph",
-    "View",
-    "explore",
-    "fit",
-    "next_best_view",
-    "read_recording",
-    "simulate",
-]
+    "Box", "Camera", "CaryatidError", "Cloud", "Config", "Cylinder", "Explorer", "InputError", "Planner",
+    "Robot", "Scene", "SceneObject", "Session", "Sphere", "Step", "Support", "SupportGraph", "View",
+    "explore", "fit", "next_best_view", "read_recording", "simulate",
+]  # fmt: skip
 
 if not TYPE_CHECKING:
     __getattr__ = imported_late(

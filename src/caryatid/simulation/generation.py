@@ -17,31 +17,22 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sphere
 from caryatid.geometry.solids import Polytope, Solid, hollowed
 from caryatid.geometry.transforms import UP, Array
+from caryatid.simulation import world
 from caryatid.simulation.world import (
     TABLE_HEIGHT,
     TABLE_SIZE,
     Body,
     Side,
     SimulatedScene,
-    body_poses,
     bounds,
-    build_spec,
-    scene_from_spec,
-    state_of,
-    strayed,
     true_shapes,
 )
 
 GeneratedKind = Literal["pile", "dense", "packed", "house", "blocks", "boards", "overhang"]
 SIZES: dict[GeneratedKind, tuple[int, int]] = {
-    "pile": (1, 25),
-    "dense": (10, 25),
-    "packed": (2, 25),
-    "house": (1, 14),
-    "blocks": (2, 10),
-    "boards": (4, 12),
-    "overhang": (4, 12),
-}
+    "pile": (1, 25), "dense": (10, 25), "packed": (2, 25), "house": (1, 14), "blocks": (2, 10),
+    "boards": (4, 12), "overhang": (4, 12),
+}  # fmt: skip
 """Kind of a scene → minimum and maximum number of objects, including the screens of a dense one."""
 GAP = 0.002
 """Height above the support from which an object is dropped [m]."""
@@ -280,8 +271,8 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
     """
 
     def build(solids: Sequence[Body], config: PhysicsConfig = physics, least: float = 0.0) -> SimulatedScene:
-        spec = build_spec(solids, name, plan.table, plan.walls)
-        return scene_from_spec(spec, name, name, config, least=least)
+        spec = world.build_spec(solids, name, plan.table, plan.walls)
+        return world.scene_from_spec(spec, name, name, config, least=least)
 
     # An object that has not come to rest after two seconds is set down again.
     impatient = replace(physics, settle_time=2.0)
@@ -329,10 +320,10 @@ def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: P
     if not scene.at_rest:
         return False
     # Nothing moves by itself, not even slowly, while the effect of a removal is observed.
-    data = state_of(scene)
+    data = world.state_of(scene)
     mujoco.mj_step(scene.model, data, nstep=round(physics.removal_time / scene.model.opt.timestep))
     limits = physics.moved / 2.0, physics.turned / 2.0
-    return not strayed(body_poses(scene.data), body_poses(data), *limits).any()
+    return not world.strayed(world.body_poses(scene.data), world.body_poses(data), *limits).any()
 
 
 def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Body:

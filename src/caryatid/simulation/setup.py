@@ -86,12 +86,7 @@ class Simulation:
 
 
 def make_simulation(
-    scene: SimulatedScene,
-    config: Config,
-    *,
-    noise: NoiseModel,
-    seed: int,
-    robot: RobotMaker | str = HUMANOID,
+    scene: SimulatedScene, config: Config, *, noise: NoiseModel, seed: int, robot: RobotMaker | str = HUMANOID
 ) -> Simulation:
     """Put a robot at its home view in front of the table, with the furniture on its floor map.
 

@@ -12,12 +12,8 @@ if TYPE_CHECKING:
     from caryatid.planning.decision import Planner
 
 VOLUMETRIC = (
-    "occlusion-aware",
-    "unobserved-voxel",
-    "rear-side-voxel",
-    "rear-side-entropy",
-    "proximity-count",
-)
+    "occlusion-aware", "unobserved-voxel", "rear-side-voxel", "rear-side-entropy", "proximity-count",
+)  # fmt: skip
 """The planners that are a `VolumetricPlanner` of the formulation of that name."""
 
 BUILT_IN: dict[str, tuple[str, ...]] = {
@@ -63,10 +59,8 @@ def make_planner(name: Planner | str) -> Planner:
         planner = others[name].load()()
         return planner
     if name == ORACLE:
-        raise InputError(
-            "planner",
-            f"'{ORACLE}' requires the ground truth of a simulated scene",
-            "give a scene, or create caryatid.evaluation.oracle.OraclePlanner",
-        )
+        reason = f"'{ORACLE}' requires the ground truth of a simulated scene"
+        remedy = "give a scene, or create caryatid.evaluation.oracle.OraclePlanner"
+        raise InputError("planner", reason, remedy)
     names = ", ".join([*BUILT_IN, *sorted(others), ORACLE])
     raise InputError("planner", f"unknown planner '{name}'", f"choose one of {names}")
