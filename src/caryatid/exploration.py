@@ -450,11 +450,7 @@ def explore(
 def reason_to_stop(state: PlanningState, changed: bool, planner: Planner, decision: Decision) -> str | None:
     """Return why another view may not be worth its path, or None.
 
-    Args:
-        state: The state that the planner used.
-        changed: Whether the newest view changed the graph.
-        planner: The planner that chose the next view.
-        decision: Its choice.
+    The planner chose this decision in this state. `changed` says whether the newest view changed the graph.
     """
     if len(state.visited) == 1:
         return None

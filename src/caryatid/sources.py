@@ -129,16 +129,7 @@ def open_source(
 ) -> Source:
     """Open an MJCF file or folder, the name of a built-in scene, or a recording.
 
-    Args:
-        source: Name, file or folder.
-        config: All settings.
-        noise: Noise of the simulated camera.
-        segmentation: `labels`, `auto`, or None to use labels if available.
-        seed: Seed of the noise.
-        robot: Name of the simulated robot.
-        masks: Source of masks, or None to use those of the views.
-        ignore: Mask of pixels to ignore in a recording, as for `without_ignored`, or None.
-        level: Rotate the world frame of a recording so that the table is level.
+    The other arguments are as in `simulate` for a scene, and as in `open_recording` for a recording.
 
     Raises:
         InputError: The source is unknown, broken, or lacks required labels; or the robot is unknown, a
@@ -205,8 +196,9 @@ def open_recording(
 ) -> Dataset:
     """Open a dataset and decode every frame once, to report a broken frame before any other work.
 
-    A few sharp frames are chosen from a video. A mask source replaces the masks of the dataset. Ignored
-    pixels are dropped. With `level`, the world frame is rotated so that the table is level.
+    A few sharp frames are chosen from a video. A mask source replaces the masks of the dataset. Pixels of a
+    mask to ignore are dropped, as by `without_ignored`. With `level`, the world frame is rotated so that the
+    table is level. The segmentation is `labels`, `auto`, or None to use labels if available.
 
     Raises:
         InputError: The dataset or the mask is broken, required labels are missing, a segment is too small

@@ -159,14 +159,9 @@ def decide(
 ) -> Decision:
     """Choose the view with the largest c = s − h, eq. 3; the first in case of a tie.
 
-    Args:
-        candidates: The views that can be reached.
-        saliency: s (C,) of each scored view.
-        cost: h (C,) of each.
-        why: Returns the reason for one of these.
-        looks: Which of the candidates were scored, and represent the others; None = all.
-        points: The points considered.
-        elsewhere: Returns s (M,) of the points of the view sphere, as a new array, without the candidates.
+    Saliency s (C,), cost h (C,) and the reason are those of the candidates in `looks`, which represent the
+    others; None = all. `elsewhere` returns s (M,) of the points of the view sphere, as a new array, without
+    the candidates.
     """
     score = saliency - cost
     best = int(np.argmax(score))

@@ -97,16 +97,7 @@ class SessionConflictError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class Beginning:
-    """Options of a session.
-
-    Attributes:
-        segmentation: `labels`, `auto`, or None to use labels if the first view has them.
-        seed: Seed of every random choice.
-        planner: Name of the planner that chooses the next view.
-        robot: Name of the robot that takes it.
-        settings: All settings.
-        ignore: PNG whose pixels other than 0 are ignored in every view, or None.
-    """
+    """Options of a session, as in `Session.begin`; pixels of `ignore`, a PNG, other than 0 are ignored."""
 
     segmentation: SegmentationMethod | None
     seed: Annotated[int, Ge(0)]

@@ -24,12 +24,8 @@ PLATFORM, MAST, NECK = 0.3, 0.04, 0.15
 class HumanoidBody:
     """A platform and a mast that the torso lift extends, in a copy of a scene.
 
-    It collides with nothing. The head is left out, because it is behind the camera.
-
-    Args:
-        scene: The scene; it does not change.
-        robot: Finds the posture for a camera pose.
-        config: Its footprint and heights.
+    It collides with nothing. The head is left out, because it is behind the camera. The robot finds its
+    posture for a camera pose.
 
     Attributes:
         scene: The copy, with the body where it was last placed.
