@@ -5,9 +5,11 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from caryatid.config import ActiveVisionConfig
 from caryatid.errors import PlanningError
@@ -168,16 +170,17 @@ def decide(
     index = best if looks is None else int(looks.chosen[best])
     candidate_saliency = saliency if looks is None else saliency[looks.nearest]
     figures = (float(saliency[best]), float(cost[best]), float(score[best]), why(best))
-
-    @one_blas_thread
-    def paint() -> Array:
-        """The view sphere, with the candidates at their points."""
-        sphere_saliency = elsewhere()
-        if candidates.indices is not None:
-            sphere_saliency[candidates.indices] = candidate_saliency
-        return sphere_saliency
-
+    paint = partial(_paint, elsewhere, candidates.indices, candidate_saliency)
     return Decision(candidates.T_world_camera[index], index, *figures, points, candidate_saliency, paint)
+
+
+@one_blas_thread
+def _paint(elsewhere: Callable[[], Array], indices: NDArray[np.intp] | None, saliency: Array) -> Array:
+    """Saliency (M,) of the view sphere with that of the candidates at their points."""
+    sphere_saliency = elsewhere()
+    if indices is not None:
+        sphere_saliency[indices] = saliency
+    return sphere_saliency
 
 
 def go_to(state: PlanningState, index: int, why: str) -> Decision:
