@@ -252,8 +252,7 @@ def extract(
         raise InputError(source, "a scene, which has no views yet", f"use `caryatid explore {source}`")
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
     if kind != "cloud":
-        recording = open_recording(source, config, segmentation, masks, ignore, level)
-        return _look_at_all(explorer, recording)
+        return _look_at_all(explorer, open_recording(source, config, segmentation, masks, ignore, level))
     if masks is not None or ignore is not None:
         remedy = "omit --masks and --ignore; a cloud has its labels in the field label"
         raise InputError(source, "masks need images, and a cloud has none", remedy)
@@ -265,8 +264,7 @@ def extract(
     cloud = stored.to_cloud(config.cloud)
     rng = np.random.default_rng(seed)
     cloud = cloud.moved(level_transform(cloud, config, rng, use_labels=use_labels))
-    steps = map(explorer.look, [cloud])
-    return (replace(step, labels=stored.spread(step.labels)) for step in steps)
+    return (replace(step, labels=stored.spread(step.labels)) for step in map(explorer.look, [cloud]))
 
 
 def _viewable(source: str) -> Kind:

@@ -45,8 +45,7 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
     shapes = true_shapes(scene)
     objects = {name: shapes[labels[name]] for name in truth.vertices if name != scene.table}
     table = scene.table if scene.table in truth.vertices else None
-    height = float(table_centre(scene)[2])
-    return TrueScene(truth.vertices, frozenset(truth.pairs), objects, table, height)
+    return TrueScene(truth.vertices, frozenset(truth.pairs), objects, table, float(table_centre(scene)[2]))
 
 
 def evaluate_run(

@@ -69,8 +69,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
         tree = _read_transforms(bag, config.pose_gap)
         for frame in dict.fromkeys([options.world, *(depth.frame for depth in depths)]):
             if frame not in tree.frames:
-                known = f"known frames: {', '.join(tree.frames)}"
-                raise InputError(path, f"unknown frame '{frame}'", known)
+                raise InputError(path, f"unknown frame '{frame}'", f"known frames: {', '.join(tree.frames)}")
         pose_at = partial(tree.between, options.world)
     if distorts:
         notes.append("the lens has distortion, but a pinhole camera is assumed: use rectified topics")

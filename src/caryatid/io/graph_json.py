@@ -162,8 +162,7 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
     known = {*ids}
     for named in (*(i for pair in pairs for i in pair), *given.stability):
         if named not in known:
-            there = f"known objects: {', '.join(ids) or 'none'}"
-            raise InputError(name, f"unknown object '{named}'", there)
+            raise InputError(name, f"unknown object '{named}'", f"known objects: {', '.join(ids) or 'none'}")
     return SupportGraph(
         tuple(o.decoded(name) for o in given.objects),
         tuple(Support(*vars(s).values()) for s in given.supports),

@@ -122,8 +122,7 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
         raise InputError(dataset.path, "has no depth images", remedy)
     if not usable:
         reason = f"none of its {skipped.total()} depth images is usable: {reasons(skipped)}"
-        remedy = _REMEDIES.get(skipped.most_common(1)[0][0], "record it again")
-        raise InputError(dataset.path, reason, remedy)
+        raise InputError(dataset.path, reason, _REMEDIES.get(skipped.most_common(1)[0][0], "record it again"))
     times = np.array([(frame.time - usable[0].time) / SECOND for frame in usable])
     poses = [frame.T_world_camera for frame in usable if frame.T_world_camera is not None]
     T_world_camera = np.stack(poses) if len(poses) == len(usable) else None

@@ -289,8 +289,7 @@ class Log:
                 if not isinstance(document, dict) or not line.startswith(b"{"):
                     if number == 1:
                         raise InputError(self.path, f"is not a {self._what}", "choose another folder")
-                    reason = f"line {number} is damaged"
-                    raise InputError(self.path, reason, LATER)
+                    raise InputError(self.path, f"line {number} is damaged", LATER)
                 if whole:
                     yield document
 

@@ -141,8 +141,7 @@ def path_cost(state: PlanningState) -> Array:
     """
     match state.config.path_cost:
         case "angle":
-            alpha = transforms.angle_between(state.visited[-1], state.candidates.directions)
-            return np.sin(alpha / 2.0)
+            return np.sin(transforms.angle_between(state.visited[-1], state.candidates.directions) / 2.0)
         case "path":
             return state.candidates.path_length / (2.0 * state.sphere.radius)
         case "none":

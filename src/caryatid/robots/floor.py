@@ -186,5 +186,4 @@ class FloorPaths:
                 heading = int(before[0]) - here
                 corners.append(here)
             corners[-1] = here + heading
-        centres = self.grid.centres(np.array(corners[::-1]))
-        return np.concatenate([self.start_world[None], centres, end_world])
+        return np.concatenate([self.start_world[None], self.grid.centres(np.array(corners[::-1])), end_world])

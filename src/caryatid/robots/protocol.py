@@ -122,8 +122,7 @@ def posture_at(T_world_camera: Array, platform_world: Array) -> Posture:
     x, y, z = T_world_camera[:3, 2].tolist()
     turn = math.atan2(y, x) - float(platform_world[2])
     head_yaw = math.atan2(math.sin(turn), math.cos(turn))
-    pitch = math.asin(min(max(z, -1.0), 1.0))
-    return Posture(platform_world, float(T_world_camera[2, 3]), head_yaw, pitch)
+    return Posture(platform_world, float(T_world_camera[2, 3]), head_yaw, math.asin(min(max(z, -1.0), 1.0)))
 
 
 def count_reasons(code: NDArray[np.intp], reasons: Sequence[str]) -> dict[str, int]:

@@ -297,8 +297,7 @@ def build_spec(
 def palette(index: int) -> tuple[float, float, float, float]:
     """Colour of the object with this number; neighbours in number differ widely in hue."""
     hue = (0.02 + index * 0.618034) % 1.0  # multiples of the golden ratio stay apart
-    value = (0.88, 0.7, 0.55)[(index // 7) % 3]
-    return (*colorsys.hsv_to_rgb(hue, 0.75, value), 1.0)
+    return (*colorsys.hsv_to_rgb(hue, 0.75, (0.88, 0.7, 0.55)[(index // 7) % 3]), 1.0)
 
 
 def quaternion(R: Array) -> Array:
@@ -431,8 +430,7 @@ def _primitive(scene: SimulatedScene, geom: int) -> Shape | None:
 def _geom_box(scene: SimulatedScene, geom: int) -> Box:
     """Return the box around a geom along the geom's own axes."""
     centre, half = scene.model.geom_aabb[geom, :3], scene.model.geom_aabb[geom, 3:]
-    T_world_geom = _geom_pose(scene, geom)
-    return Box(T_world_geom @ transforms.rigid(np.eye(3), centre), 2.0 * half)
+    return Box(_geom_pose(scene, geom) @ transforms.rigid(np.eye(3), centre), 2.0 * half)
 
 
 def _span(scene: SimulatedScene, geom: int) -> tuple[Array, Array]:

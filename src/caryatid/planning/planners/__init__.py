@@ -46,18 +46,15 @@ def make_planner(name: Planner | str) -> Planner:
     Raises:
         InputError: There is none, and the message lists the known ones; or it is `oracle`.
     """
-    planner: Planner
     if not isinstance(name, str):
         check_type("planner", name, "plan", "give the name of a planner, or an object with a method plan()")
         return name
     if name in BUILT_IN:
         module, maker, *arguments = BUILT_IN[name]
-        planner = getattr(import_module(f"{__name__}.{module}"), maker)(*arguments)
-        return planner
+        return getattr(import_module(f"{__name__}.{module}"), maker)(*arguments)
     others = offered()
     if name in others:
-        planner = others[name].load()()
-        return planner
+        return others[name].load()()
     if name == ORACLE:
         reason = f"'{ORACLE}' requires the ground truth of a simulated scene"
         remedy = "give a scene, or create caryatid.evaluation.oracle.OraclePlanner"
