@@ -14,19 +14,17 @@ import signal
 import socket
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import uvicorn
 from fastapi import Depends, FastAPI, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPBearer
-from numpy.typing import ArrayLike
 from pydantic import Base64Bytes, BaseModel, ConfigDict, Field
 from starlette.middleware.base import RequestResponseEndpoint
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -43,7 +41,7 @@ from caryatid.io.staging import BusyError
 from caryatid.manipulation.order import plan_order
 from caryatid.runtime.parallel import cores
 from caryatid.sessions import Capture, Session
-from caryatid.sessions.messages import CameraRecord, CandidateViews
+from caryatid.sessions.messages import CameraRecord, CandidateViews, check_limits
 from caryatid.sessions.session import SessionConflictError, is_session
 from caryatid.support.relations import Effect
 
@@ -158,33 +156,6 @@ class SessionPool:
         """Close all sessions but this number of the most recently used ones."""
         while len(self._open) > most:
             self._open.pop(next(iter(self._open))).close()
-
-
-def check_limits(own: Config, asked: Config) -> None:
-    """Reject settings of a client that change a limit, or another setting by more than a factor of ten.
-
-    Raises:
-        InputError: The error names the setting.
-    """
-    remedy = "change it in the settings of the service"
-    for stage, values in asdict(asked).items():
-        for name, value in values.items():
-            before = getattr(getattr(own, stage), name)
-            if value != before and (stage == "session" or name in ("max_voxels", "max_pixels")):
-                raise InputError(f"{stage}.{name}", "is a limit of the service", remedy)
-            if _is_far(value, before):
-                reason = f"differs from this service's {before} by more than a factor of ten"
-                raise InputError(f"{stage}.{name}", reason, remedy)
-
-
-def _is_far(value: ArrayLike, before: ArrayLike) -> bool:
-    """Whether numbers differ by more than a factor of ten in size, or in how many there are."""
-    given, ours = np.ravel(value), np.ravel(before)
-    if given.dtype.kind not in "if" or not ours.any():
-        return False
-    given, ours = np.abs(given), np.abs(ours)
-    far = (given > 0) & ((given < ours[ours > 0].min() / 10.0) | (given > 10.0 * ours.max()))
-    return bool(far.any()) or len(given) > 10 * len(ours)
 
 
 def make_app(

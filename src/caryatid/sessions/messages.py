@@ -1,4 +1,4 @@
-"""What clients of a session send, and what it answers."""
+"""What clients of a session send and may set, and what it answers."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from annotated_types import Gt
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from caryatid.config import SessionConfig
+from caryatid.config import Config, SessionConfig
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Change, SupportGraph
@@ -205,3 +205,30 @@ class NextView:
             "why": d.why,
             "stop": self.stop,
         }
+
+
+def check_limits(own: Config, asked: Config) -> None:
+    """Reject settings of a client that change a limit of a service, or another by more than a factor of ten.
+
+    Raises:
+        InputError: The error names the setting.
+    """
+    remedy = "change it in the settings of the service"
+    for stage, values in asdict(asked).items():
+        for name, value in values.items():
+            before = getattr(getattr(own, stage), name)
+            if value != before and (stage == "session" or name in ("max_voxels", "max_pixels")):
+                raise InputError(f"{stage}.{name}", "is a limit of the service", remedy)
+            if _is_far(value, before):
+                reason = f"differs from this service's {before} by more than a factor of ten"
+                raise InputError(f"{stage}.{name}", reason, remedy)
+
+
+def _is_far(value: ArrayLike, before: ArrayLike) -> bool:
+    """Whether numbers differ by more than a factor of ten in size, or in how many there are."""
+    given, ours = np.ravel(value), np.ravel(before)
+    if given.dtype.kind not in "if" or not ours.any():
+        return False
+    given, ours = np.abs(given), np.abs(ours)
+    far = (given > 0) & ((given < ours[ours > 0].min() / 10.0) | (given > 10.0 * ours.max()))
+    return bool(far.any()) or len(given) > 10 * len(ours)
