@@ -126,8 +126,7 @@ def graph_to_json(graph: SupportGraph) -> dict[str, Any]:
             id_: asdict(verdict) | ({} if isfinite(verdict.overhang) else {"overhang": None})
             for id_, verdict in sorted(graph.stability.items())
         }
-    result: dict[str, Any] = plain(document)
-    return result
+    return plain(document)
 
 
 def graph_text(graph: SupportGraph) -> str:

@@ -77,12 +77,11 @@ def parse_json(
     try:
         if not _largest(document) <= LARGEST:
             raise ValueError(f"a number is larger than {LARGEST:.2g}")
-        read: T = _adapter(kind).validate_json(json.dumps(document, allow_nan=False), strict=True)
+        return _adapter(kind).validate_json(json.dumps(document, allow_nan=False), strict=True)
     except ValidationError as error:
         raise InputError(str(source), _sentence(error.errors()[0]), remedy) from None
     except (ValueError, RecursionError) as error:
         raise InputError(str(source), f"cannot be read ({error})", remedy) from None
-    return read
 
 
 def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any]:

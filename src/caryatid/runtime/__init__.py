@@ -38,8 +38,7 @@ class Pictured:
     __slots__ = ()
 
     def _repr_html_(self) -> str:
-        drawn: str = call("notebook cell", self)
-        return drawn
+        return call("notebook cell", self)
 
 
 LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely")

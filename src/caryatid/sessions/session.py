@@ -481,8 +481,7 @@ class Session:
             content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != event.digest:
             raise InputError(path, "has changed since it was written", RESTORE)
-        view: View = unpack(content, (View,))
-        return replace(view, name=event.name)
+        return replace(unpack(content, (View,)), name=event.name)
 
     def _apply(self, event: Event, scene: Scene) -> None:
         if event.kind == "view":
