@@ -14,15 +14,9 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates, Posture
+from caryatid.robots import protocol
 from caryatid.robots.floor import FloorGrid
-from caryatid.robots.protocol import (
-    OwnViews,
-    SimulatedRobot,
-    Unreachable,
-    count_reasons,
-    posture_at,
-    straight_lengths,
-)
+from caryatid.robots.protocol import OwnViews, SimulatedRobot, Unreachable
 from caryatid.robots.reachability import ReachabilityMap
 from caryatid.sensing.view_sphere import ViewSphere
 
@@ -151,7 +145,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         if self._offer is None or self._offer[0] is not sphere:
             self._offer = sphere, self._offered(sphere)
         views = self._offer[1]
-        return views.from_elsewhere(straight_lengths(self._T_world_camera, views.T_world_camera))
+        return views.from_elsewhere(protocol.straight_lengths(self._T_world_camera, views.T_world_camera))
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
         """Ask `confirm` whether the arm can go to a candidate (4, 4); None = it can."""
@@ -171,7 +165,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
     def _posture_of(self, T_world_camera: Array) -> Posture:
         """The posture at a pose (4, 4), with the joint positions that `confirm` last returned for it."""
         base_yaw = float(np.arctan2(*self.T_world_base[[1, 0], 0]))
-        posture = posture_at(T_world_camera, np.array([*self.T_world_base[:2, 3], base_yaw]))
+        posture = protocol.posture_at(T_world_camera, np.array([*self.T_world_base[:2, 3], base_yaw]))
         T_confirmed, joints = self._confirmed
         return replace(posture, joints=joints) if np.array_equal(T_confirmed, T_world_camera) else posture
 
@@ -188,7 +182,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         left = np.flatnonzero(code < 0)
         held, reached = self._in_some_roll(poses[left])
         code[left[~reached]] = 2
-        rejected, good = count_reasons(code, REASONS), left[reached]
+        rejected, good = protocol.count_reasons(code, REASONS), left[reached]
         return Candidates(held[reached], sphere.directions[good], np.zeros(len(good)), rejected, good)
 
     def _in_some_roll(self, T_world_camera: Array) -> tuple[Array, NDArray[np.bool_]]:

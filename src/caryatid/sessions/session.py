@@ -28,18 +28,10 @@ from annotated_types import Ge
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Base64Bytes
 
+from caryatid import exploration
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, NoSurfaceError, PlanningError
-from caryatid.exploration import (
-    Explorer,
-    Step,
-    given_candidates,
-    next_best_view,
-    planning_state,
-    reachable_views,
-    reason_to_stop,
-    used_up,
-)
+from caryatid.exploration import Explorer, Step
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array, as_rigid
@@ -383,7 +375,7 @@ class Session:
         first = self.scene.T_world_cameras[0]
         T_world_cameras = np.stack([first if event.T is None else event.T for event in self._views])
         if candidates is not None:
-            reachable = given_candidates(candidates, path_length, T_world_cameras[-1], sphere)
+            reachable = exploration.given_candidates(candidates, path_length, T_world_cameras[-1], sphere)
         else:
             place = Surroundings(sphere.centre_world, table_floor(self.scene), self.scene.config)
             robot = find_robot(self.beginning.robot)(place)
@@ -395,11 +387,13 @@ class Session:
             reachable = reachable.without(as_rigid(T, f"refused[{number}]"), REFUSED)
         visited = sphere.direction_of(T_world_cameras)
         planner = make_planner(self.beginning.planner)
-        decision = next_best_view(self.scene, robot, visited, candidates=reachable, planner=planner)
-        state = planning_state(self.scene, sphere, visited, reachable)
+        decision = exploration.next_best_view(
+            self.scene, robot, visited, candidates=reachable, planner=planner
+        )
+        state = exploration.planning_state(self.scene, sphere, visited, reachable)
         reports = [number for number, event in enumerate(self._events, start=1) if event.kind == "report"]
-        stop = used_up(len(self._events) - max(reports, default=0), state.config)
-        stop = stop or reason_to_stop(state, self.scene.changed, planner, decision)
+        stop = exploration.used_up(len(self._events) - max(reports, default=0), state.config)
+        stop = stop or exploration.reason_to_stop(state, self.scene.changed, planner, decision)
         return NextView(self.views, decision, stop)
 
     def replay(self) -> Iterator[Step]:
@@ -546,8 +540,8 @@ def reached_candidates(robot: Robot, T_world_camera: Array, sphere: ViewSphere) 
     for T in (T_world_camera, transforms.look_at(T_world_camera[:3, 3], sphere.centre_world)):
         with suppress(PlanningError):
             robot.move_to(T)
-            return reachable_views(robot, sphere)
-    found = reachable_views(robot, sphere)
+            return exploration.reachable_views(robot, sphere)
+    found = exploration.reachable_views(robot, sphere)
     return found.from_elsewhere(straight_lengths(T_world_camera, found.T_world_camera))
 
 

@@ -18,15 +18,7 @@ from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sph
 from caryatid.geometry.solids import Polytope, Solid, hollowed
 from caryatid.geometry.transforms import UP, Array
 from caryatid.simulation import world
-from caryatid.simulation.world import (
-    TABLE_HEIGHT,
-    TABLE_SIZE,
-    Body,
-    Side,
-    SimulatedScene,
-    bounds,
-    true_shapes,
-)
+from caryatid.simulation.world import TABLE_HEIGHT, TABLE_SIZE, Body, Side, SimulatedScene
 
 GeneratedKind = Literal["pile", "dense", "packed", "house", "blocks", "boards", "overhang"]
 SIZES: dict[GeneratedKind, tuple[int, int]] = {
@@ -142,7 +134,7 @@ def _packed(rng: np.random.Generator, size: int) -> _Plan:
             return _on_another(rng, shape, scene), True
         azimuth = rng.uniform(-np.pi, np.pi)
         outward_world = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        return Body(_pushed(shape, outward_world, list(true_shapes(scene).values()))), False
+        return Body(_pushed(shape, outward_world, list(world.true_shapes(scene).values()))), False
 
     return _Plan(draw)
 
@@ -284,10 +276,10 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
             return build(solids)
         solid, stacked = plan.draw(below)
         tried = build([*solids, solid], impatient, least=0.3)
-        on_the_table = bounds(tried, len(solids) + 1)[0][2] <= TABLE_HEIGHT + GAP
+        on_the_table = world.bounds(tried, len(solids) + 1)[0][2] <= TABLE_HEIGHT + GAP
         slipped = stacked and failures < TRIES // 2 and on_the_table
         if not slipped and _stands(tried, solids[:fixed] or solids, plan, physics):
-            shapes = true_shapes(tried).values()
+            shapes = world.true_shapes(tried).values()
             solids = [replace(s, shape=shape) for s, shape in zip([*solids, solid], shapes, strict=True)]
             below, failures = tried, 0
             continue
@@ -305,10 +297,10 @@ def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: P
     first; none may reach higher than 36 cm above the table. Setting down another one may shift the firm ones
     by up to 4 cm.
     """
-    shapes = true_shapes(scene)
+    shapes = world.true_shapes(scene)
     half = np.array(plan.table) / 2.0 - 0.01
     for label, shape in shapes.items():
-        low, high = bounds(scene, label)
+        low, high = world.bounds(scene, label)
         if low[2] < TABLE_HEIGHT - GAP or high[2] > TABLE_HEIGHT + 0.36:
             return False
         if label > len(plan.screens) and (np.abs(shape.T_world_object[:2, 3]) > half).any():
@@ -331,15 +323,15 @@ def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Body:
     over = shape.moved(transforms.rigid(np.eye(3), (*xy, 0.0)))
     tops = [TABLE_HEIGHT]
     if scene is not None:
-        others = true_shapes(scene).items()
-        tops += [float(bounds(scene, label)[1][2]) for label, other in others if _overlap(over, other)]
+        others = world.true_shapes(scene).items()
+        tops += [float(world.bounds(scene, label)[1][2]) for label, other in others if _overlap(over, other)]
     z = max(tops) + float(shape.support(np.array([[0.0, 0.0, -1.0]]))[0]) + GAP
     return Body(over.moved(transforms.rigid(np.eye(3), (0.0, 0.0, z))))
 
 
 def _on_another(rng: np.random.Generator, shape: Shape, scene: SimulatedScene) -> Body:
     """Put a shape from the origin over a random object, up to 0.3 of its half extents off its middle."""
-    below = list(true_shapes(scene).values())[int(rng.integers(len(scene.object_bodies)))]
+    below = list(world.true_shapes(scene).values())[int(rng.integers(len(scene.object_bodies)))]
     reach = 0.3 * below.support(np.eye(3))[:2]
     xy = below.T_world_object[:2, 3] + reach * rng.uniform(-1.0, 1.0, size=2)
     return _let_go(shape, xy, scene)

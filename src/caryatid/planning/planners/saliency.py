@@ -11,15 +11,10 @@ from numpy.typing import NDArray
 
 from caryatid.config import ActiveVisionConfig
 from caryatid.geometry.transforms import Array
+from caryatid.planning import points_of_interest as interest
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
-from caryatid.planning.points_of_interest import (
-    PointOfInterest,
-    hidden_from,
-    inhibition_of_return,
-    painted,
-    points_of_interest,
-)
+from caryatid.planning.points_of_interest import PointOfInterest, inhibition_of_return, painted
 
 
 class AttentionPlanner:
@@ -38,10 +33,10 @@ class AttentionPlanner:
         """
         check_candidates(state)
         config, directions, visited = state.config, state.candidates.directions, state.visited
-        points = points_of_interest(state.graph, state.sphere, visited, config)
+        points = interest.points_of_interest(state.graph, state.sphere, visited, config)
         hidden = None
         if points and config.occlusion != "ignore":
-            hidden = hidden_from(state.candidates.T_world_camera[:, :3, 3], points, state.voxels).T
+            hidden = interest.hidden_from(state.candidates.T_world_camera[:, :3, 3], points, state.voxels).T
         given = _given(points, directions, config, hidden)
 
         def why(best: int) -> str:
@@ -110,12 +105,12 @@ class PaperPlanner:
         check_candidates(state)
         config = replace(state.config, saliency="paper", edge_point="midpoint", path_cost="angle")
         state = replace(state, config=config)
-        points = points_of_interest(state.graph, state.sphere, state.visited, config)
+        points = interest.points_of_interest(state.graph, state.sphere, state.visited, config)
         points = [_at_reachable_height(point, state.candidates) for point in points]
         added = [p for p in points if _reachable(p.direction, state)]
         ends = np.array([p.direction for p in added]).reshape(-1, 3)
         eyes_world = state.sphere.centre_world + state.sphere.radius * ends
-        hidden = np.diag(hidden_from(eyes_world, added, state.voxels))
+        hidden = np.diag(interest.hidden_from(eyes_world, added, state.voxels))
         directions = state.candidates.directions
 
         def why(best: int) -> str:
