@@ -292,10 +292,7 @@ class Explorer:
         return reason_to_stop(state, self.scene.changed, self._planner, step.decision)
 
     def predict(self) -> Step:
-        """Predict what moves when the goal is removed.
-
-        Returns:
-            The newest step, with its `removal`.
+        """Predict what moves when the goal is removed: the `removal` of the newest step, which is returned.
 
         Raises:
             PlanningError: No view was taken yet.
@@ -308,13 +305,10 @@ class Explorer:
         return self._newest()
 
     def choose(self, chosen: Decision | int) -> Step:
-        """Choose another view instead of the planner's.
+        """Choose another view instead of the planner's, and return the newest step with it and its waypoints.
 
         Args:
             chosen: A decision, or the index of one of the newest step's candidates.
-
-        Returns:
-            The newest step, with this decision and its waypoints.
 
         Raises:
             PlanningError: The candidate does not exist, the robot refuses it, or nothing was planned.
@@ -363,13 +357,7 @@ class Explorer:
         return step
 
     def put_aside(self, why: str) -> Step:
-        """Put the next view aside, because the robot cannot go there, and plan again among the others.
-
-        Args:
-            why: The reason.
-
-        Returns:
-            The newest step, as from `plan`.
+        """Put the next view aside, because the robot cannot go there for a reason, and `plan` again.
 
         Raises:
             PlanningError: No view is planned.

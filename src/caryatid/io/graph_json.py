@@ -99,12 +99,9 @@ class _Graph:
 
 
 def graph_to_json(graph: SupportGraph) -> dict[str, Any]:
-    """Write a graph as the document of graph.json.
+    """Write a graph as the document of graph.json: plain dicts, lists, texts and numbers.
 
     Keys come in a fixed order and floats are rounded to a nanometre, so the same graph gives the same bytes.
-
-    Returns:
-        Plain dicts, lists, texts and numbers.
     """
     objects = []
     for o in graph.objects:

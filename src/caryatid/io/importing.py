@@ -91,10 +91,8 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
     """Choose sharp frames of a video, each from another viewpoint; single images count as sharp.
 
     Sharpness is the variance of the Laplacian of the brightness. Without colour it is the share of pixels
-    with a reading, because a moving depth camera loses readings at edges.
-
-    Returns:
-        The dataset with the chosen frames, ordered by time; the others count as skipped.
+    with a reading, because a moving depth camera loses readings at edges. The chosen frames are ordered by
+    time; the others count as skipped.
 
     Raises:
         InputError: No frame can become a view.
@@ -140,10 +138,8 @@ def choose_views(
     ones. If there are too many, those farthest from each other stay.
 
     Frames have ascending times (N,) [s], N > 0, sharpness (N,), of which only ratios count, and poses
-    (N, 4, 4). Without poses, a single frame is chosen.
-
-    Returns:
-        Indices of the chosen frames, ascending, and the number of others by reason.
+    (N, 4, 4). Without poses, a single frame is chosen. Return the indices of the chosen ones, ascending, and
+    the number of others by reason.
     """
     if T_world_camera is None:
         return [int(np.argmax(sharpness))], dict(+Counter({SPARE: len(times) - 1}))

@@ -51,7 +51,7 @@ def find_grasp(
     voxels: VoxelMap | None = None,
     reachable: Reachable | None = None,
 ) -> Grasp | Blocked:
-    """Find the best grasp of an object that nothing obstructs.
+    """Find the best grasp of an object that nothing obstructs, or say why there is none.
 
     Grasps nearer to the centre of mass and more downward are better.
 
@@ -63,9 +63,6 @@ def find_grasp(
         voxels: What was seen empty; None = only known shapes obstruct.
         reachable: Which gripper poses (N, 4, 4), in the world frame, the arm reaches; None = all. The arm has
             to reach the grasp, the start of its approach, and the end of the lift.
-
-    Returns:
-        The grasp, or why there is none.
     """
     jaw = gripper.kind == "parallel"
     found = list(_antipodal(shape, gripper, friction) if jaw else _flat(shape, gripper))

@@ -90,10 +90,8 @@ def surface_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
 def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | None:
     """Find the box over the table, within the map, that may hold something, up to the highest object's top.
 
-    It begins two voxels over the table, clear of readings of its top.
-
-    Returns:
-        Its corners (3,) and (3,) [m], or None without a table, objects, or space between them.
+    It begins two voxels over the table, clear of readings of its top. Return its corners (3,) and (3,) [m],
+    or None without a table, objects, or space between them.
     """
     table = graph.support_surface
     objects = [o for o in graph.objects if o.role == "object"]

@@ -76,11 +76,7 @@ class FloorGrid:
         return cls(free, np.asarray(origin_world, dtype=np.float64), cell)
 
     def cells(self, points_world: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Find the cells under points (N, 2+) [m].
-
-        Returns:
-            Flat cell indices (N,), 0 if outside, and which points are on the floor (N,).
-        """
+        """Find the cells under points (N, 2+) [m]: flat indices (N,), 0 if outside, and which exist (N,)."""
         column, row = np.floor((points_world[:, :2] - self.origin_world) / self.cell).astype(np.intp).T
         height, width = self.free.shape
         inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)

@@ -421,10 +421,7 @@ class Session:
         yield replace(newest, graph=scene.graph, cloud=scene.cloud, stop=stop)
 
     def undo(self) -> int:
-        """Undo the last view, or the last report after it.
-
-        Returns:
-            Number of views left.
+        """Undo the last view, or the last report after it, and return the number of views left.
 
         Raises:
             InputError: The session has no views, or an earlier one is broken; the session does not change.
