@@ -273,7 +273,9 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @app.post("/sessions/{name}/next")
     def choose_next_view(name: Name, given: CandidateViews) -> dict[str, Any]:
         """Plan the next best view among poses that your robot can reach, or without those that it cannot."""
-        return pool.session(name).next(**given.arguments).to_json()
+        return (
+            pool.session(name).next(given.T_world_camera, given.path_length, refused=given.refused).to_json()
+        )
 
     @app.post("/sessions/{name}/order")
     def order_removals(name: Name, given: NewOrder) -> dict[str, Any]:

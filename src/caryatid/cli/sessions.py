@@ -54,7 +54,7 @@ def plan_view(command: Next) -> None:
                 remedy = "give camera poses to choose from, or those that the robot refuses as 'refused'"
                 raise InputError(command.candidates, "'T_world_camera' is missing", remedy)
             given = parse_json(CandidateViews, document, command.candidates)
-        view = session.next(**given.arguments)
+        view = session.next(given.T_world_camera, given.path_length, refused=given.refused)
     command.output.result(view.to_json())
 
 

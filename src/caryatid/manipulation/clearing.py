@@ -62,8 +62,13 @@ def clear(
         CaryatidError: A view cannot be used.
     """
     views = missed = 0
-    for step in past:
-        _repeat(explorer, step)
+    for step in past:  # repeat its view, and remove the object of its lift
+        if explorer.step is not None:
+            explorer.go()
+        explorer.look(step.view)
+        if step.lift is not None:
+            explorer.scene.removed(step.lift.object_id)
+        explorer.step = step
         views = 0 if step.lift is not None else views + 1
     while explorer.step is None or explorer.step.decision is not None:
         if explorer.step is not None and (step := explorer.go()).stop is not None:
@@ -121,16 +126,6 @@ def _lift(
     if lift is not None:
         return None, f"no lift is safe: lifting {lift.object_id} {lift.why}"
     return None, f"{reason}; {missing}"
-
-
-def _repeat(explorer: Explorer, step: Step) -> None:
-    """Repeat a step's view, and remove the object of its lift."""
-    if explorer.step is not None:
-        explorer.go()
-    explorer.look(step.view)
-    if step.lift is not None:
-        explorer.scene.removed(step.lift.object_id)
-    explorer.step = step
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -139,12 +139,6 @@ class CandidateViews:
     path_length: Annotated[Array, Numbers(-1)] | None = None
     refused: Annotated[Array, Numbers(-1, 4, 4)] | None = None
 
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """Arguments of `Session.next`."""
-        refused = () if self.refused is None else self.refused
-        return {"candidates": self.T_world_camera, "path_length": self.path_length, "refused": refused}
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Added:

@@ -355,7 +355,7 @@ class Session:
         candidates: ArrayLike | None = None,
         path_length: ArrayLike | None = None,
         *,
-        refused: Iterable[ArrayLike] = (),
+        refused: Iterable[ArrayLike] | None = None,
     ) -> NextView:
         """Plan the next best view.
 
@@ -381,7 +381,7 @@ class Session:
             robot = find_robot(self.beginning.robot)(place)
             sphere = view_sphere_of(robot, sphere)
             reachable = reached_candidates(robot, T_world_cameras[-1], sphere)
-        for number, T in enumerate(refused):
+        for number, T in enumerate([] if refused is None else refused):
             if robot is None:
                 raise InputError("refused", "is given with candidates", "omit them from the candidates")
             reachable = reachable.without(as_rigid(T, f"refused[{number}]"), REFUSED)
