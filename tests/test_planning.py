@@ -42,7 +42,7 @@ from caryatid.planning.points_of_interest import (
 )
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
-from caryatid.robots.recording import RecordingRobot
+from caryatid.robots.protocol import RecordingRobot
 from caryatid.sensing.view_sphere import ViewSphere, direction
 from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
 from caryatid.support.relations import Effect, Removal

@@ -19,8 +19,8 @@ from caryatid.robots import Posture, Surroundings, find_robot, go_home
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
+from caryatid.robots.protocol import RecordingRobot
 from caryatid.robots.reachability import sample_reachability, write_reachability
-from caryatid.robots.recording import RecordingRobot
 from caryatid.sensing.view_sphere import ViewSphere, direction
 from caryatid.sessions import Session
 from caryatid.sessions.session import table_floor

@@ -26,7 +26,7 @@ from caryatid.io.importing import choose_frames, levelled
 from caryatid.io.mask_sources import MaskSource, without_ignored
 from caryatid.io.point_clouds import read_stored_cloud
 from caryatid.robots import HUMANOID, Robot, find_robot
-from caryatid.robots.recording import RecordingCamera, RecordingRobot
+from caryatid.robots.protocol import RecordingCamera, RecordingRobot
 from caryatid.scene import KEPT, LEFT_OUT
 from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import Camera
