@@ -367,7 +367,16 @@ def _outline(scene: SimulatedScene, geom: int) -> Array:
 
 def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
     """Lowest and highest corner, (3,) each [m], of the world-aligned box around an object (0: the table)."""
-    lows, highs = zip(*(_span(scene, geom) for geom in _solid_geoms(scene, label)), strict=True)
+    lows, highs = [], []
+    for geom in _solid_geoms(scene, label):
+        shape = _primitive(scene, geom)
+        points = _outline(scene, geom) if shape is None else shape.T_world_object[None, :3, 3]
+        reach = np.zeros(3) if shape is None else shape.support(np.eye(3))
+        if isinstance(shape, Cylinder):  # as `support` to the last digit but one, and seeds keep their scenes
+            axis = np.abs(shape.T_world_object[:3, 2])
+            reach = shape.height / 2.0 * axis + shape.radius * np.sqrt(np.clip(1.0 - axis**2, 0.0, None))
+        lows.append(points.min(axis=0) - reach)
+        highs.append(points.max(axis=0) + reach)
     return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
@@ -431,16 +440,3 @@ def _geom_box(scene: SimulatedScene, geom: int) -> Box:
     """Return the box around a geom along the geom's own axes."""
     centre, half = scene.model.geom_aabb[geom, :3], scene.model.geom_aabb[geom, 3:]
     return Box(_geom_pose(scene, geom) @ transforms.rigid(np.eye(3), centre), 2.0 * half)
-
-
-def _span(scene: SimulatedScene, geom: int) -> tuple[Array, Array]:
-    """Lowest and highest corner, (3,) each [m], of the world-aligned box around a geom."""
-    shape = _primitive(scene, geom)
-    if shape is None:
-        corners = _outline(scene, geom)
-        return corners.min(axis=0), corners.max(axis=0)
-    centre, reach = shape.T_world_object[:3, 3], shape.support(np.eye(3))
-    if isinstance(shape, Cylinder):  # as `support` to the last digit but one, and seeds keep their scenes
-        axis = np.abs(shape.T_world_object[:3, 2])
-        reach = shape.height / 2.0 * axis + shape.radius * np.sqrt(np.clip(1.0 - axis**2, 0.0, None))
-    return centre - reach, centre + reach
