@@ -239,10 +239,14 @@ class Explorer:
             visited = np.concatenate([visited, sphere.direction_of(T_world_camera)[None]])
             if len(visited) > 1:
                 angle += float(transforms.angle_between(visited[-2], visited[-1]))
+        posture, pose = None if kept or robot is None else robot.solve(robot.T_world_camera), None
+        if robot is not None and isinstance(posture, Posture):
+            footprint = scene.config.robot.footprint
+            pose = RobotPose(posture, robot.T_world_camera, footprint, isinstance(robot, ArmRobot))
         return Step(
             scene.views - 1, source.name, view, scene.labels, scene.graph, scene.cloud, sphere, visited,
             None, None, {"capture": captured} | scene.timings, angle, path, None,
-            None if kept else self._robot_pose(),
+            pose,
             scene.new_changes,
         )  # fmt: skip
 
@@ -372,13 +376,6 @@ class Explorer:
     def _state(self, candidates: Candidates) -> PlanningState:
         step = self._newest()
         return planning_state(self.scene, step.sphere, step.visited, candidates, self.goal)
-
-    def _robot_pose(self) -> RobotPose | None:
-        robot, footprint = self.robot, self.scene.config.robot.footprint
-        posture = None if robot is None else robot.solve(robot.T_world_camera)
-        if robot is None or not isinstance(posture, Posture):
-            return None
-        return RobotPose(posture, robot.T_world_camera, footprint, isinstance(robot, ArmRobot))
 
     def _moving(self) -> Robot:
         if self.robot is None:

@@ -6,6 +6,7 @@ score. No other planner may use the ground truth, so it is not in `caryatid.plan
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -97,7 +98,10 @@ class OraclePlanner:
         best, reached = int(order[0]), -1.0
         equal = 1e-9  # scores are ratios of small integers
         for k in order:
-            f1 = self._f1_after(candidates.T_world_camera[tried[k]])
+            scene, f1 = self._scene.copy(), -1.0  # for a view that cannot be used
+            with suppress(CaryatidError):
+                view = self._simulated.fork().capture(candidates.T_world_camera[tried[k]])
+                f1 = self._f1(scene.update(view))
             if f1 > reached + equal:
                 best, reached = int(k), f1
             if reached > 1.0 - equal:
@@ -120,15 +124,6 @@ class OraclePlanner:
             reason = "its views and settings differ from those of this exploration"
             remedy = "pass its camera to explore(), with the same configuration, segmentation and seed"
             raise InputError(f"planner {ORACLE}", reason, remedy)
-
-    def _f1_after(self, T_world_camera: Array) -> float:
-        """F1 of the fused graph after a view from there, or -1 if that view cannot be used."""
-        scene = self._scene.copy()
-        try:
-            graph = scene.update(self._simulated.fork().capture(T_world_camera))
-        except CaryatidError:
-            return -1.0
-        return self._f1(graph)
 
     def _f1(self, graph: SupportGraph) -> float:
         return score(graph, self._truth, config=self._config.evaluation).f1

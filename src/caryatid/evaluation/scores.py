@@ -135,9 +135,20 @@ def score(
         config: Minimum IoU, tolerance of the table's height, points per pair.
     """
     config = config or EvaluationConfig()
-    shapes = [o.shape for o in graph.objects if o.role == "object"]
     rng = rng or np.random.default_rng(0)
-    iou = _volume_ious(shapes, list(truth.objects.values()), config.samples, rng)
+    found, true = [o.shape for o in graph.objects if o.role == "object"], list(truth.objects.values())
+    # By Monte Carlo; 10,000 points per pair: σ = 0.01 at worst.
+    iou, true_bounds = np.zeros((len(found), len(true))), [_bounds(shape) for shape in true]
+    for i, a in enumerate(found):
+        low_a, high_a = _bounds(a)
+        for j, (b, (low_b, high_b)) in enumerate(zip(true, true_bounds, strict=True)):
+            if (np.maximum(low_a, low_b) >= np.minimum(high_a, high_b)).any():
+                continue
+            start, end = np.minimum(low_a, low_b), np.maximum(high_a, high_b)
+            points_world = rng.uniform(start, end, size=(config.samples, 3))
+            in_a, in_b = _inside(a, points_world), _inside(b, points_world)
+            union = int(np.count_nonzero(in_a | in_b))
+            iou[i, j] = np.count_nonzero(in_a & in_b) / union if union else 0.0
     same = abs(_top_height(graph) - truth.table_top) <= config.table_tolerance
     table = truth.table if same else None
     return _matched(graph, truth.vertices, truth.edges, iou, list(truth.objects), table, config.min_iou)
@@ -227,25 +238,6 @@ def average_precision(forecasts: Sequence[Forecast]) -> float:
     if not true.any():
         return float(len(steps) == 0)
     return float(np.diff(hits, prepend=0.0) @ (hits / (steps + 1)) / true.sum())
-
-
-def _volume_ious(
-    found: Sequence[Shape], true: Sequence[Shape], samples: int, rng: np.random.Generator
-) -> Array:
-    """Intersection over union (F, T) of shapes by Monte Carlo; 10,000 points per pair: σ = 0.01 at worst."""
-    iou = np.zeros((len(found), len(true)))
-    true_bounds = [_bounds(shape) for shape in true]
-    for i, a in enumerate(found):
-        low_a, high_a = _bounds(a)
-        for j, (b, (low_b, high_b)) in enumerate(zip(true, true_bounds, strict=True)):
-            if (np.maximum(low_a, low_b) >= np.minimum(high_a, high_b)).any():
-                continue
-            start, end = np.minimum(low_a, low_b), np.maximum(high_a, high_b)
-            points_world = rng.uniform(start, end, size=(samples, 3))
-            in_a, in_b = _inside(a, points_world), _inside(b, points_world)
-            union = int(np.count_nonzero(in_a | in_b))
-            iou[i, j] = np.count_nonzero(in_a & in_b) / union if union else 0.0
-    return iou
 
 
 def _inside(shape: Shape, points_world: Array) -> NDArray[np.bool_]:

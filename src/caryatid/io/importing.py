@@ -156,7 +156,12 @@ def choose_views(
         best = candidates[soon][np.argmax(sharpness[candidates[soon]])]
         chosen.append(int(best))
         free &= _apart(T_world_camera[candidates], T_world_camera[best], config) > 1.0
-    kept = _farthest(T_world_camera[chosen], config)
+    # Of too many, the first stays, and then always the one farthest from those that stay.
+    kept, poses = [0], T_world_camera[chosen]
+    gap = _apart(poses, poses[0], config)
+    while len(kept) < min(config.max_views, len(poses)):
+        kept.append(int(np.argmax(gap)))
+        gap = np.minimum(gap, _apart(poses, poses[kept[-1]], config))
     others = Counter({"blurred": len(times) - len(candidates), SPARE: len(chosen) - len(kept)})
     others["same viewpoint as another view"] = len(candidates) - len(chosen)
     return sorted(chosen[i] for i in kept), dict(+others)
@@ -214,13 +219,3 @@ def _apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig)
     distance = np.linalg.norm(T_world_camera[:, :3, 3] - T_world_other[:3, 3], axis=1)
     turns = Rotation.from_matrix(T_world_other[:3, :3].T @ T_world_camera[:, :3, :3])
     return np.maximum(distance / config.min_distance, np.degrees(turns.magnitude()) / config.min_angle)
-
-
-def _farthest(T_world_camera: Array, config: RecordingConfig) -> list[int]:
-    """Indices of up to `max_views` poses: the first, then always the one farthest from those chosen."""
-    kept = [0]
-    gap = _apart(T_world_camera, T_world_camera[0], config)
-    while len(kept) < min(config.max_views, len(T_world_camera)):
-        kept.append(int(np.argmax(gap)))
-        gap = np.minimum(gap, _apart(T_world_camera, T_world_camera[kept[-1]], config))
-    return kept
