@@ -11,7 +11,6 @@ import numpy as np
 from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.scores import Score, TrueScene, score, score_masks
-from caryatid.geometry.transforms import Array
 from caryatid.io.bop import read_recording
 from caryatid.io.datasets import find_sample
 from caryatid.simulation.lifting import ASIDE
@@ -103,25 +102,20 @@ def evaluate_run(
 def _truths(run: Run, scene: SimulatedScene) -> Iterator[TrueScene]:
     """The truth at each view; a graph that lacks the object lifted after its view is that after the lift."""
     lifts = {lift["view"]: lift for lift in run.record.get("lifts", ())}
-    true = true_scene_from_simulation(scene)
+    true, names = true_scene_from_simulation(scene), list(scene.object_bodies.values())
     for number, view in enumerate(run.views):
         lift, after = lifts.get(number), true
         if lift is not None:
-            after = _truth_after(scene, np.array(lift["state"]))
+            state = np.array(lift["state"])
+            if state.shape != (len(names), 7):
+                reason = f"has {len(names)} objects, but the run removed objects from {len(state)}"
+                raise InputError(scene.source, reason, "give the scene of this run")
+            lifted = posed(scene, state)
+            gone = {name for name, z in zip(names, state[:, 2], strict=True) if z >= ASIDE / 2.0}
+            known = ground_truth(lifted)
+            vertices = tuple(name for name in known.vertices if name not in gone)
+            edges = tuple(edge for edge in known.edges if not {edge.supporter, edge.supported} & gone)
+            after = true_scene_from_simulation(lifted, GroundTruth(vertices, edges))
         lacks = lift is not None and all(o.id != lift["object"] for o in view.graph.objects)
         yield after if lacks else true
         true = after
-
-
-def _truth_after(scene: SimulatedScene, state: Array) -> TrueScene:
-    """The truth of the objects of a scene that are not put aside, in a state (N, 7)."""
-    names = list(scene.object_bodies.values())
-    if state.shape != (len(names), 7):
-        reason = f"has {len(names)} objects, but the run removed objects from {len(state)}"
-        raise InputError(scene.source, reason, "give the scene of this run")
-    scene = posed(scene, state)
-    gone = {name for name, z in zip(names, state[:, 2], strict=True) if z >= ASIDE / 2.0}
-    known = ground_truth(scene)
-    vertices = tuple(name for name in known.vertices if name not in gone)
-    edges = tuple(edge for edge in known.edges if not {edge.supporter, edge.supported} & gone)
-    return true_scene_from_simulation(scene, GroundTruth(vertices, edges))

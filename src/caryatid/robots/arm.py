@@ -173,6 +173,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         return ViewSphere(centre_world, radius, transforms.rotate(self.T_world_base, fibonacci_sphere(count)))
 
     def _offered(self, sphere: ViewSphere) -> Candidates:
+        """The views of a sphere within reach, each rolled by the smallest sufficient angle."""
         poses = sphere.poses(sphere.directions)
         eyes = poses[:, :3, 3]
         code = np.full(len(poses), -1)
@@ -180,24 +181,18 @@ class ArmRobot(SimulatedRobot, OwnViews):
             code[self._furniture.hidden(eyes, sphere.centre_world)] = 1
         code[eyes[:, 2] < sphere.centre_world[2] + self._config.clearance] = 0
         left = np.flatnonzero(code < 0)
-        held, reached = self._in_some_roll(poses[left])
-        code[left[~reached]] = 2
-        rejected, good = protocol.count_reasons(code, REASONS), left[reached]
-        return Candidates(held[reached], sphere.directions[good], np.zeros(len(good)), rejected, good)
-
-    def _in_some_roll(self, T_world_camera: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Roll poses (N, 4, 4) by the smallest sufficient angle; return them, and which are reached (N,)."""
-        held = T_world_camera.copy()
-        reached = np.zeros(len(held), dtype=np.bool_)
+        held, reached = poses[left], np.zeros(len(left), dtype=np.bool_)
         turns = np.arange(self._config.rolls) * (2.0 * np.pi / self._config.rolls)
         turns = np.minimum(turns, 2.0 * np.pi - turns) * np.where(turns > np.pi, -1.0, 1.0)
         for turn in turns[np.argsort(np.abs(turns), kind="stable")]:
-            left = np.flatnonzero(~reached)
+            rest = np.flatnonzero(~reached)
             R = transforms.rotation_from_vector((0.0, 0.0, turn))
-            rolled = T_world_camera[left] @ transforms.rigid(R, np.zeros(3))
+            rolled = poses[left[rest]] @ transforms.rigid(R, np.zeros(3))
             found = self._reaches(rolled)
-            held[left[found]], reached[left[found]] = rolled[found], True
-        return held, reached
+            held[rest[found]], reached[rest[found]] = rolled[found], True
+        code[left[~reached]] = 2
+        rejected, good = protocol.count_reasons(code, REASONS), left[reached]
+        return Candidates(held[reached], sphere.directions[good], np.zeros(len(good)), rejected, good)
 
     def _reaches(self, T_world_camera: Array) -> NDArray[np.bool_]:
         """Ask which poses (N, 4, 4) the hand reaches (N,)."""
