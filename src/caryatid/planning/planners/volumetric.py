@@ -62,7 +62,12 @@ class VolumetricPlanner:
         """
         check_candidates(state)
         candidates, config = state.candidates, state.config
-        looks = _new_views(state, candidates.looks(config.look_directions))
+        looks = candidates.looks(config.look_directions)
+        # Nearer to an earlier view than to one another.
+        cosine = candidates.directions[looks.chosen] @ state.visited.T
+        old = cosine.max(axis=1) >= np.cos(np.sqrt(4.0 * np.pi / config.look_directions))
+        if not old.all():
+            looks = Looks.of(looks.chosen[~old], candidates.directions)
         corners = space_above(state.graph, state.voxels)
         gain = np.zeros(len(looks.chosen))
         if corners is not None:
@@ -86,14 +91,6 @@ class VolumetricPlanner:
         ratio, share = gain[best] / gain.mean(), gain[best] / gain.max()
         mean = f"{ratio:.1f} times the mean {self._formulation} information of all views"
         return f"{mean}, {share:.0%} of the maximum"
-
-
-def _new_views(state: PlanningState, looks: Looks) -> Looks:
-    """Leave out candidates nearer to an earlier view than to one another, unless that is all."""
-    directions = state.candidates.directions
-    cosine = directions[looks.chosen] @ state.visited.T
-    old = cosine.max(axis=1) >= np.cos(np.sqrt(4.0 * np.pi / state.config.look_directions))
-    return looks if old.all() else Looks.of(looks.chosen[~old], directions)
 
 
 @cache
