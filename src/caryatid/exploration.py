@@ -317,9 +317,8 @@ class Explorer:
         Raises:
             PlanningError: The candidate does not exist, the robot refuses it, or nothing was planned.
         """
-        check_type(
-            "chosen", chosen, (Decision, int, np.integer), "give a decision or the index of a candidate"
-        )
+        remedy = "give a decision or the index of a candidate"
+        check_type("chosen", chosen, (Decision, int, np.integer), remedy)
         step = self._newest()
         if isinstance(chosen, Decision):
             decision = chosen

@@ -137,9 +137,7 @@ class SupportGraph(Pictured):
         for candidate in self.objects:
             if candidate.id == object_id:
                 return candidate
-        raise KeyError(
-            f"unknown object '{object_id}'; known objects: {', '.join(o.id for o in self.objects)}"
-        )
+        raise KeyError(f"unknown object '{object_id}'; known objects: {', '.join(self)}")
 
     def __contains__(self, object_id: object) -> bool:
         return any(o.id == object_id for o in self.objects)

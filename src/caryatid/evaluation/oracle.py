@@ -141,11 +141,8 @@ class OraclePlanner:
         points_world = T_world_camera[:3, 3] + reach * rays_world[on_object]
         cells = 4096  # along each axis around the world's origin: 41 m
         place = np.floor(points_world / self._config.voxels.size).astype(np.int64) + cells // 2
-        return np.unique(
-            np.ravel_multi_index(
-                (labels[on_object], *np.clip(place, 0, cells - 1).T), (int(labels.max()) + 1, *(cells,) * 3)
-            )
-        )
+        counts = int(labels.max()) + 1, cells, cells, cells
+        return np.unique(np.ravel_multi_index((labels[on_object], *np.clip(place, 0, cells - 1).T), counts))
 
 
 def planner_for(

@@ -55,9 +55,8 @@ class _Object:
     def decoded(self, source: str) -> SceneObject:
         source = f"{source} ('{self.id}')"
         lengths = self.size.values() if isinstance(self.size, dict) else self.size
-        if self.shape != Solid.kind and not all(
-            isinstance(length, float) and length > 0.0 for length in lengths
-        ):
+        positive = all(isinstance(length, float) and length > 0.0 for length in lengths)
+        if self.shape != Solid.kind and not positive:
             raise InputError(source, f"size {self.size} is not positive", "give sizes in metres")
         given = dict(vars(self))
         given["shape"] = from_size(self.shape, given.pop("T_world_object"), given.pop("size"), source)

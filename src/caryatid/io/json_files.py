@@ -57,9 +57,8 @@ def Numbers(*shape: int, rigid: bool = False) -> GetPydanticSchema:
         except InputError as error:
             raise ValueError(error.reason) from None
 
-    return GetPydanticSchema(
-        lambda _, __: core_schema.no_info_plain_validator_function(read), lambda _, __: schema
-    )
+    validator = core_schema.no_info_plain_validator_function(read)
+    return GetPydanticSchema(lambda _, __: validator, lambda _, __: schema)
 
 
 def parse_json(

@@ -142,9 +142,8 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
             remedy = f"give the folder of a scene, or of a recording (scene_camera.json, depth.txt); {listed}"
             raise InputError(text, f"a folder without {SCENE_FILE}", remedy)
     if path.suffix.lower() != ".xml" or not path.is_file():
-        raise InputError(
-            path, "not an MJCF file", f"give an .xml file or a folder with a {SCENE_FILE}; {listed}"
-        )
+        remedy = f"give an .xml file or a folder with a {SCENE_FILE}; {listed}"
+        raise InputError(path, "not an MJCF file", remedy)
     _check_sizes(path, config or PhysicsConfig())
     try:
         with world.mujoco_warnings_ignored():

@@ -112,11 +112,9 @@ def scene_from_spec(
     geom_labels = np.where(np.isin(geom_roots, free), np.searchsorted(free, geom_roots) + 1, 0)
     if unseen := set(names) - set(geom_labels.tolist()):
         raise InputError(source, f"body '{names[min(unseen)]}' has no geom", "give every object a shape")
-    data = mujoco.MjData(model)
+    data, labels = mujoco.MjData(model), geom_labels.astype(np.int32)
     at_rest = _settle(model, data, source, config or PhysicsConfig(), least=least)
-    return SimulatedScene(
-        model, data, spec, name, source, names, TABLE, geom_labels.astype(np.int32), at_rest
-    )
+    return SimulatedScene(model, data, spec, name, source, names, TABLE, labels, at_rest)
 
 
 def _settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: float) -> bool:
