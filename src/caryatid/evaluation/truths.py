@@ -87,9 +87,7 @@ def evaluate_run(
             for n, view in enumerate(run.views, 1)
         ]
     else:
-        why = "no such scene or recording"
-        if folder.exists():
-            why = "neither a scene nor a recording"
+        why = "neither a scene nor a recording" if folder.exists() else "no such scene or recording"
         remedy = "give a scene (scene.xml), or a recording with scene_camera.json and gt.json"
         raise InputError(source, why, remedy)
     if not scores[-1].ious and len(run.views[-1].graph.objects) > 1:
