@@ -40,8 +40,7 @@ from caryatid.config import Config, GripperConfig
 from caryatid.config.settings import read_settings
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Grasp, TakeStep
-from caryatid.manipulation.clearing import clear
-from caryatid.manipulation.dismantling import SimulatedHands, Taken
+from caryatid.manipulation.clearing import SimulatedHands, Taken, clear
 from caryatid.manipulation.grasps import gripper_boxes
 from caryatid.manipulation.order import plan_order
 from caryatid.simulation.lifting import Lifting

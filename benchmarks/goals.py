@@ -26,7 +26,7 @@ from caryatid.config.settings import read_settings
 from caryatid.evaluation.scores import TrueScene
 from caryatid.exploration import explore
 from caryatid.graph import SupportGraph
-from caryatid.manipulation.dismantling import bodies_of
+from caryatid.manipulation.clearing import bodies_of
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import displaced_without

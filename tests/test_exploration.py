@@ -17,7 +17,7 @@ from caryatid.graph import SupportGraph
 from caryatid.io import read_recording, write_recording
 from caryatid.io.graph_json import graph_text
 from caryatid.robots import Unreachable
-from caryatid.robots.recording import RecordingCamera, RecordingRobot
+from caryatid.robots.protocol import RecordingCamera, RecordingRobot
 from caryatid.scene import Scene
 from caryatid.simulation.setup import make_simulation
 from caryatid.steps import RunWriter, read_run, read_steps

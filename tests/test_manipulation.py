@@ -19,8 +19,7 @@ from caryatid.exploration import Explorer
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Uncertainty
 from caryatid.graph import Grasp, Support, SupportGraph, TakeStep
-from caryatid.manipulation.clearing import clear
-from caryatid.manipulation.dismantling import SimulatedHands, bodies_of
+from caryatid.manipulation.clearing import SimulatedHands, bodies_of, clear
 from caryatid.manipulation.grasps import Blocked, find_grasp, gripper_boxes
 from caryatid.manipulation.order import plan_order
 from caryatid.robots.reachability import ReachabilityMap, write_reachability

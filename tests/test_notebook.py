@@ -16,7 +16,7 @@ from caryatid.geometry.transforms import look_at
 from caryatid.graph import SupportGraph, TakeStep
 from caryatid.manipulation.order import Order
 from caryatid.planning.decision import Decision
-from caryatid.runtime.display import Pictured
+from caryatid.runtime import Pictured
 from caryatid.sensing.views import Cloud, View
 from caryatid.simulation import load_scene
 from caryatid.simulation.setup import make_simulation

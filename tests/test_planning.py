@@ -24,8 +24,9 @@ from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.expected_visibility import (
     SPACE,
+    predict_goal,
+    settled,
 )
-from caryatid.planning.goals import predict_goal, settled
 from caryatid.planning.planners import BUILT_IN, VOLUMETRIC, make_planner
 from caryatid.planning.planners.baselines import STOPS, RandomPlanner
 from caryatid.planning.planners.volumetric import ray_information
@@ -36,7 +37,7 @@ from caryatid.planning.points_of_interest import (
 )
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
-from caryatid.robots.recording import RecordingRobot
+from caryatid.robots.protocol import RecordingRobot
 from caryatid.sensing.view_sphere import ViewSphere, direction
 from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
 from caryatid.support.relations import Effect, Removal

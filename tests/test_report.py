@@ -25,10 +25,9 @@ from caryatid.exploration import RobotPose, Step
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere, fibonacci_sphere
 from caryatid.graph import Change, SceneObject, Stability, Support, SupportGraph
-from caryatid.planning.candidates import Candidates
+from caryatid.planning.candidates import Candidates, Posture
 from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
-from caryatid.planning.posture import Posture
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.viz.colours import object_colour, rgb

@@ -19,11 +19,11 @@ from caryatid.robots import Posture, Surroundings, find_robot, go_home
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
+from caryatid.robots.protocol import RecordingRobot
 from caryatid.robots.reachability import sample_reachability, write_reachability
-from caryatid.robots.recording import RecordingRobot
 from caryatid.sensing.view_sphere import ViewSphere, direction
 from caryatid.sessions import Session
-from caryatid.sessions.next_view import table_floor
+from caryatid.sessions.session import table_floor
 
 CONFIG = RobotConfig()
 UP = (0.0, 0.0, 1.0)

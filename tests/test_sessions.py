@@ -20,12 +20,12 @@ from caryatid.errors import CaryatidError, InputError, PlanningError
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.io.images import png
-from caryatid.io.log import BusyError
+from caryatid.io.staging import BusyError
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
 from caryatid.sessions import Capture, Session
 from caryatid.sessions import session as session_module
-from caryatid.sessions.captures import CameraRecord
+from caryatid.sessions.messages import CameraRecord
 from caryatid.sessions.session import SessionConflictError, _Unpickler
 
 LOG = "session.jsonl"

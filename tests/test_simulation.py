@@ -17,7 +17,7 @@ from caryatid.config import Config, LiftConfig, NoiseConfig, PhysicsConfig, Robo
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Shape
-from caryatid.planning.posture import Posture
+from caryatid.planning.candidates import Posture
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation import (
     SimulatedCamera,

@@ -30,7 +30,7 @@ from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry import transforms
 from caryatid.graph import Support, SupportGraph
-from caryatid.manipulation.dismantling import SimulatedHands, bodies_of
+from caryatid.manipulation.clearing import SimulatedHands, bodies_of
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from caryatid.runtime import imported_late
-from caryatid.runtime.display import hooks
+from caryatid.runtime import hooks, imported_late
 
 if TYPE_CHECKING:
     from caryatid.config import Config
@@ -31,30 +30,10 @@ hooks |= {
 }
 
 __all__ = [
-    "Box",
-    "Camera",
-    "CaryatidError",
-    "Cloud",
-    "Config",
-    "Cylinder",
-    "Explorer",
-    "InputError",
-    "Planner",
-    "Robot",
-    "Scene",
-    "SceneObject",
-    "Session",
-    "Sphere",
-    "Step",
-    "Support",
-    "SupportGraph",
-    "View",
-    "explore",
-    "fit",
-    "next_best_view",
-    "read_recording",
-    "simulate",
-]
+    "Box", "Camera", "CaryatidError", "Cloud", "Config", "Cylinder", "Explorer", "InputError", "Planner",
+    "Robot", "Scene", "SceneObject", "Session", "Sphere", "Step", "Support", "SupportGraph", "View",
+    "explore", "fit", "next_best_view", "read_recording", "simulate",
+]  # fmt: skip
 
 if not TYPE_CHECKING:
     __getattr__ = imported_late(

@@ -18,13 +18,13 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import Change, SupportGraph, TakeStep
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, Planner, PlanningState, check_candidates, path_cost
-from caryatid.planning.goals import predict_goal, settled
+from caryatid.planning.expected_visibility import predict_goal, settled
 from caryatid.planning.planners import make_planner
 from caryatid.planning.planners.hidden_surface import SupportPlanner
 from caryatid.robots import Posture, Robot, Unreachable, view_sphere_of, way_to
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.protocol import straight_lengths
-from caryatid.runtime.display import Pictured
+from caryatid.runtime import Pictured
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.scene import Scene, Stopwatch
 from caryatid.sensing.view_sphere import ViewSphere
@@ -239,10 +239,14 @@ class Explorer:
             visited = np.concatenate([visited, sphere.direction_of(T_world_camera)[None]])
             if len(visited) > 1:
                 angle += float(transforms.angle_between(visited[-2], visited[-1]))
+        posture, pose = None if kept or robot is None else robot.solve(robot.T_world_camera), None
+        if robot is not None and isinstance(posture, Posture):
+            footprint = scene.config.robot.footprint
+            pose = RobotPose(posture, robot.T_world_camera, footprint, isinstance(robot, ArmRobot))
         return Step(
             scene.views - 1, source.name, view, scene.labels, scene.graph, scene.cloud, sphere, visited,
             None, None, {"capture": captured} | scene.timings, angle, path, None,
-            None if kept else self._robot_pose(),
+            pose,
             scene.new_changes,
         )  # fmt: skip
 
@@ -292,10 +296,7 @@ class Explorer:
         return reason_to_stop(state, self.scene.changed, self._planner, step.decision)
 
     def predict(self) -> Step:
-        """Predict what moves when the goal is removed.
-
-        Returns:
-            The newest step, with its `removal`.
+        """Predict what moves when the goal is removed: the `removal` of the newest step, which is returned.
 
         Raises:
             PlanningError: No view was taken yet.
@@ -308,39 +309,33 @@ class Explorer:
         return self._newest()
 
     def choose(self, chosen: Decision | int) -> Step:
-        """Choose another view instead of the planner's.
+        """Choose another view instead of the planner's, and return the newest step with it and its waypoints.
 
         Args:
             chosen: A decision, or the index of one of the newest step's candidates.
 
-        Returns:
-            The newest step, with this decision and its waypoints.
-
         Raises:
             PlanningError: The candidate does not exist, the robot refuses it, or nothing was planned.
         """
-        check_type(
-            "chosen", chosen, (Decision, int, np.integer), "give a decision or the index of a candidate"
-        )
-        decision = chosen if isinstance(chosen, Decision) else self._by_hand(int(chosen))
-        robot, T_world_camera = self._moving(), decision.T_world_camera
-        way = way_to(robot, T_world_camera)
+        remedy = "give a decision or the index of a candidate"
+        check_type("chosen", chosen, (Decision, int, np.integer), remedy)
+        step = self._newest()
+        if isinstance(chosen, Decision):
+            decision = chosen
+        else:
+            index, candidates = int(chosen), step.candidates
+            if step.decision is None or candidates is None or not 0 <= index < len(candidates):
+                raise PlanningError(f"candidate {index} does not exist; choose an index of step.candidates")
+            rated, T_world_camera = step.decision.candidate_saliency, candidates.T_world_camera[index]
+            saliency = 0.0 if rated is None else float(rated[index])
+            cost = float(path_cost(self._state(candidates))[index])
+            decision = replace(step.decision, saliency=saliency, cost=cost, score=saliency - cost)
+            decision = replace(decision, T_world_camera=T_world_camera, index=index, why="chosen by hand")
+        way = way_to(self._moving(), decision.T_world_camera)
         if isinstance(way, Unreachable):
             raise PlanningError(way.reason)
-        decision = decision.with_waypoints(way)
-        self.step = replace(self._newest(), decision=decision, stop=None)
+        self.step = replace(step, decision=decision.with_waypoints(way), stop=None)
         return self.step
-
-    def _by_hand(self, index: int) -> Decision:
-        step = self._newest()
-        if step.decision is None or step.candidates is None or not 0 <= index < len(step.candidates):
-            raise PlanningError(f"candidate {index} does not exist; choose an index of step.candidates")
-        rated = step.decision.candidate_saliency
-        saliency = 0.0 if rated is None else float(rated[index])
-        cost = float(path_cost(self._state(step.candidates))[index])
-        T_world_camera, score = step.candidates.T_world_camera[index], saliency - cost
-        decision = replace(step.decision, T_world_camera=T_world_camera, index=index, why="chosen by hand")
-        return replace(decision, saliency=saliency, cost=cost, score=score)
 
     def go(self) -> Step:
         """Move the robot to the next view; put views aside to which it cannot go, and go to another.
@@ -357,22 +352,15 @@ class Explorer:
             raise PlanningError("no next view is planned; call plan() first")
         while step.decision is not None:
             try:
-                path = robot.move_to(step.decision.T_world_camera)
+                path = step.path_travelled + robot.move_to(step.decision.T_world_camera)
+                self.step = replace(step, path_travelled=path)
+                return self.step
             except PlanningError as error:
                 step = self.put_aside(str(error))
-            else:
-                step = self.step = replace(step, path_travelled=step.path_travelled + path)
-                break
         return step
 
     def put_aside(self, why: str) -> Step:
-        """Put the next view aside, because the robot cannot go there, and plan again among the others.
-
-        Args:
-            why: The reason.
-
-        Returns:
-            The newest step, as from `plan`.
+        """Put the next view aside, because the robot cannot go there for a reason, and `plan` again.
 
         Raises:
             PlanningError: No view is planned.
@@ -386,14 +374,7 @@ class Explorer:
 
     def _state(self, candidates: Candidates) -> PlanningState:
         step = self._newest()
-        return _state(self.scene, step.sphere, step.visited, candidates, self.goal)
-
-    def _robot_pose(self) -> RobotPose | None:
-        robot, footprint = self.robot, self.scene.config.robot.footprint
-        posture = None if robot is None else robot.solve(robot.T_world_camera)
-        if robot is None or not isinstance(posture, Posture):
-            return None
-        return RobotPose(posture, robot.T_world_camera, footprint, isinstance(robot, ArmRobot))
+        return planning_state(self.scene, step.sphere, step.visited, candidates, self.goal)
 
     def _moving(self) -> Robot:
         if self.robot is None:
@@ -419,19 +400,10 @@ def explore(
     until: float | None = None,
     early_stop: bool = True,
 ) -> Iterator[Step]:
-    """Explore until no view is worth its path, or `max_views` is reached.
+    """Explore until no view is worth its path, or `config.active.max_views` is reached.
 
-    Args:
-        camera: Camera that takes the views.
-        robot: Robot, placed at the first view.
-        planner: Planner of the next view, or its name.
-        config: Settings of all stages; `config.active.max_views` limits the views.
-        segmentation: `labels`, `auto`, or None to use labels if available.
-        seed: Seed of every random choice.
-        masks: Source of masks, or None to use those of the views.
-        goal: As for `Explorer`.
-        until: As for `Explorer`.
-        early_stop: Whether to stop before `max_views`, by `config.active.stop` and `until`.
+    With `early_stop`, it may stop before, by `config.active.stop` and `until`. The other arguments are as in
+    `Explorer`.
 
     Yields:
         A step after each view; the last one again, with `stop`, if the robot can go to no further view.
@@ -462,11 +434,7 @@ def explore(
 def reason_to_stop(state: PlanningState, changed: bool, planner: Planner, decision: Decision) -> str | None:
     """Return why another view may not be worth its path, or None.
 
-    Args:
-        state: The state that the planner used.
-        changed: Whether the newest view changed the graph.
-        planner: The planner that chose the next view.
-        decision: Its choice.
+    The planner chose this decision in this state. `changed` says whether the newest view changed the graph.
     """
     if len(state.visited) == 1:
         return None
@@ -539,7 +507,9 @@ def next_best_view(
         candidates = reachable_views(robot, sphere)
     elif not isinstance(candidates, Candidates):
         candidates = given_candidates(candidates, path_length, poses[-1] if poses else None, sphere)
-    return _decide(_state(scene, sphere, visited, candidates), robot, make_planner(planner), scene.seed)[0]
+    return _decide(
+        planning_state(scene, sphere, visited, candidates), robot, make_planner(planner), scene.seed
+    )[0]
 
 
 def reachable_views(robot: Robot, sphere: ViewSphere) -> Candidates:
@@ -605,8 +575,9 @@ def _refused_all(why: str) -> PlanningError:
     return PlanningError(f"the robot refused {ATTEMPTS} views in a row: {why}")
 
 
-def _state(
+def planning_state(
     scene: Scene, sphere: ViewSphere, visited: Array, candidates: Candidates, goal: str | None = None
 ) -> PlanningState:
+    """What a planner is told about a scene, after views in directions (V, 3)."""
     assert scene.voxels is not None
     return PlanningState(scene.graph, sphere, scene.voxels, visited, candidates, scene.config.active, goal)

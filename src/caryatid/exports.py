@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from caryatid.config import ExportConfig
-from caryatid.config.choices import ExportFormat
+from caryatid.config import ExportConfig, ExportFormat
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from caryatid.geometry.shapes import Shape, Uncertainty
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.display import Pictured
+from caryatid.runtime import Pictured
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -137,9 +137,7 @@ class SupportGraph(Pictured):
         for candidate in self.objects:
             if candidate.id == object_id:
                 return candidate
-        raise KeyError(
-            f"unknown object '{object_id}'; known objects: {', '.join(o.id for o in self.objects)}"
-        )
+        raise KeyError(f"unknown object '{object_id}'; known objects: {', '.join(self)}")
 
     def __contains__(self, object_id: object) -> bool:
         return any(o.id == object_id for o in self.objects)

@@ -23,7 +23,7 @@ from caryatid.objects.changes import ChangeDetector, appeared
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed, without
 from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
-from caryatid.runtime.display import Pictured, call
+from caryatid.runtime import Pictured, call
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.segmentation.holes import count_holes
 from caryatid.segmentation.observation import Observation, label_image, observe

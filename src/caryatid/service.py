@@ -14,19 +14,17 @@ import signal
 import socket
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import uvicorn
 from fastapi import Depends, FastAPI, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPBearer
-from numpy.typing import ArrayLike
 from pydantic import Base64Bytes, BaseModel, ConfigDict, Field
 from starlette.middleware.base import RequestResponseEndpoint
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -39,12 +37,11 @@ from caryatid.geometry.transforms import Array
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import read_mask
 from caryatid.io.json_files import Numbers
-from caryatid.io.log import BusyError
+from caryatid.io.staging import BusyError
 from caryatid.manipulation.order import plan_order
 from caryatid.runtime.parallel import cores
 from caryatid.sessions import Capture, Session
-from caryatid.sessions.captures import CameraRecord
-from caryatid.sessions.next_view import CandidateViews
+from caryatid.sessions.messages import CameraRecord, CandidateViews, check_limits
 from caryatid.sessions.session import SessionConflictError, is_session
 from caryatid.support.relations import Effect
 
@@ -56,10 +53,8 @@ PATIENCE = 30.0
 """Maximum time for a request's body to arrive [s]: 16 MB at half a megabyte per second."""
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", description="Name of the session")]
-Settings = Annotated[
-    dict[str, dict[str, Any]],
-    Field(description="Settings to change, as in `caryatid config --json`: stage → name → value"),
-]
+_SETTINGS = Field(description="Settings to change, as in `caryatid config --json`: stage → name → value")
+Settings = Annotated[dict[str, dict[str, Any]], _SETTINGS]
 
 
 class Document(BaseModel):
@@ -95,13 +90,6 @@ class NewView(Document):
     """Grey PNG, or .npy (H, W) of integers: the object of each pixel, 0 = no object."""
     number: int | None = Field(None, ge=0)
     """Number of the view, from 0; makes retries safe: the last view is not added twice."""
-
-    def capture(self) -> Capture:
-        """The view, its images not decoded yet."""
-        images = {"depth": self.depth, "rgb": self.rgb, "labels": self.labels}
-        name = "view" if self.number is None else f"view {self.number + 1}"
-        given = {key: content for key, content in images.items() if content is not None}
-        return Capture(given, replace(self.camera, name=name))
 
 
 class NewReport(Document):
@@ -170,33 +158,6 @@ class SessionPool:
             self._open.pop(next(iter(self._open))).close()
 
 
-def check_limits(own: Config, asked: Config) -> None:
-    """Reject settings of a client that change a limit, or another setting by more than a factor of ten.
-
-    Raises:
-        InputError: The error names the setting.
-    """
-    for stage, values in asdict(asked).items():
-        for name, value in values.items():
-            before, reason = getattr(getattr(own, stage), name), None
-            if stage == "session" or name in ("max_voxels", "max_pixels"):
-                reason = "is a limit of the service"
-            elif _is_far(value, before):
-                reason = f"differs from this service's {before} by more than a factor of ten"
-            if value != before and reason is not None:
-                raise InputError(f"{stage}.{name}", reason, "change it in the settings of the service")
-
-
-def _is_far(value: ArrayLike, before: ArrayLike) -> bool:
-    """Whether numbers differ by more than a factor of ten in size, or in how many there are."""
-    given, ours = np.ravel(value), np.ravel(before)
-    if given.dtype.kind not in "if" or not ours.any():
-        return False
-    given, ours = np.abs(given), np.abs(ours)
-    far = (given > 0) & ((given < ours[ours > 0].min() / 10.0) | (given > 10.0 * ours.max()))
-    return bool(far.any()) or len(given) > 10 * len(ours)
-
-
 def make_app(
     pool: SessionPool, *, token: str | None, max_request: int, waiting: int, host: str = "127.0.0.1"
 ) -> FastAPI:
@@ -250,9 +211,8 @@ def make_app(
 
 
 def _add_pages(app: FastAPI, pool: SessionPool) -> None:
-    def state(session: Session) -> dict[str, Any]:
-        graph = graph_to_json(session.graph)
-        return {"views": session.views, "reports": session.reports, "graph": graph}
+    def counts(session: Session) -> dict[str, Any]:
+        return {"views": session.views, "reports": session.reports}
 
     @app.get("/sessions")
     def list_sessions() -> dict[str, list[str]]:
@@ -264,7 +224,7 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         """Return the options of a session, and its numbers of views and reports."""
         session = pool.session(name)
         options = {key: getattr(session.beginning, key) for key in ("segmentation", "seed", "planner")}
-        return {"name": name} | options | {"views": session.views, "reports": session.reports}
+        return {"name": name} | options | counts(session)
 
     @app.post("/sessions", status_code=201)
     def begin_session(given: NewSession) -> dict[str, Any]:
@@ -280,22 +240,25 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     def add_view(name: Name, given: NewView) -> dict[str, Any]:
         """Add a view; once this returns, the view is safe on disk."""
         pool.check_room()
-        return pool.session(name).add(given.capture(), given.number).to_json()
+        camera = replace(given.camera, name="view" if given.number is None else f"view {given.number + 1}")
+        images = {"depth": given.depth, "rgb": given.rgb, "labels": given.labels}
+        known = {key: content for key, content in images.items() if content is not None}
+        return pool.session(name).add(Capture(known, camera), given.number).to_json()
 
     @app.post("/sessions/{name}/reports", status_code=201)
     def report_change(name: Name, given: NewReport) -> dict[str, Any]:
         """Report an object that was removed or moved; once this returns, the report is safe on disk."""
         pool.check_room()
         session = pool.session(name)
-        session.take(given.object, given.T, given.number)
-        return state(session)
+        graph = session.take(given.object, given.T, given.number)
+        return counts(session) | {"graph": graph_to_json(graph)}
 
     @app.delete("/sessions/{name}/views/last")
     def undo_view(name: Name) -> dict[str, Any]:
         """Undo the last view, or the last report after it."""
         session = pool.session(name)
         session.undo()
-        return state(session)
+        return counts(session) | {"graph": graph_to_json(session.graph)}
 
     @app.get("/sessions/{name}/graph")
     def get_graph(name: Name) -> dict[str, Any]:
@@ -310,7 +273,9 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @app.post("/sessions/{name}/next")
     def choose_next_view(name: Name, given: CandidateViews) -> dict[str, Any]:
         """Plan the next best view among poses that your robot can reach, or without those that it cannot."""
-        return pool.session(name).next(**given.arguments).to_json()
+        return (
+            pool.session(name).next(given.T_world_camera, given.path_length, refused=given.refused).to_json()
+        )
 
     @app.post("/sessions/{name}/order")
     def order_removals(name: Name, given: NewOrder) -> dict[str, Any]:
@@ -318,11 +283,10 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         scene = pool.session(name).scene
         config = changed_settings(scene.config, given.settings, "settings")
         check_limits(pool.config, config)
-        asked = given.model_dump(include={"goal", "hands"})
-        order = plan_order(
-            scene.graph, config, **asked, seed=scene.seed, threads=cores(), voxels=scene.voxels
-        )
-        return order.to_json()
+        return plan_order(
+            scene.graph, config, goal=given.goal, hands=given.hands, seed=scene.seed, threads=cores(),
+            voxels=scene.voxels,
+        ).to_json()  # fmt: skip
 
     @app.get("/sessions/{name}/effects/{object_id}")
     def predict_removal(name: Name, object_id: str) -> list[Effect]:

@@ -26,7 +26,7 @@ from caryatid.io.importing import choose_frames, levelled
 from caryatid.io.mask_sources import MaskSource, without_ignored
 from caryatid.io.point_clouds import read_stored_cloud
 from caryatid.robots import HUMANOID, Robot, find_robot
-from caryatid.robots.recording import RecordingCamera, RecordingRobot
+from caryatid.robots.protocol import RecordingCamera, RecordingRobot
 from caryatid.scene import KEPT, LEFT_OUT
 from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import Camera
@@ -129,16 +129,7 @@ def open_source(
 ) -> Source:
     """Open an MJCF file or folder, the name of a built-in scene, or a recording.
 
-    Args:
-        source: Name, file or folder.
-        config: All settings.
-        noise: Noise of the simulated camera.
-        segmentation: `labels`, `auto`, or None to use labels if available.
-        seed: Seed of the noise.
-        robot: Name of the simulated robot.
-        masks: Source of masks, or None to use those of the views.
-        ignore: Mask of pixels to ignore in a recording, as for `without_ignored`, or None.
-        level: Rotate the world frame of a recording so that the table is level.
+    The other arguments are as in `simulate` for a scene, and as in `open_recording` for a recording.
 
     Raises:
         InputError: The source is unknown, broken, or lacks required labels; or the robot is unknown, a
@@ -205,8 +196,9 @@ def open_recording(
 ) -> Dataset:
     """Open a dataset and decode every frame once, to report a broken frame before any other work.
 
-    A few sharp frames are chosen from a video. A mask source replaces the masks of the dataset. Ignored
-    pixels are dropped. With `level`, the world frame is rotated so that the table is level.
+    A few sharp frames are chosen from a video. A mask source replaces the masks of the dataset. Pixels of a
+    mask to ignore are dropped, as by `without_ignored`. With `level`, the world frame is rotated so that the
+    table is level. The segmentation is `labels`, `auto`, or None to use labels if available.
 
     Raises:
         InputError: The dataset or the mask is broken, required labels are missing, a segment is too small
@@ -260,8 +252,7 @@ def extract(
         raise InputError(source, "a scene, which has no views yet", f"use `caryatid explore {source}`")
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
     if kind != "cloud":
-        recording = open_recording(source, config, segmentation, masks, ignore, level)
-        return _look_at_all(explorer, recording)
+        return _look_at_all(explorer, open_recording(source, config, segmentation, masks, ignore, level))
     if masks is not None or ignore is not None:
         remedy = "omit --masks and --ignore; a cloud has its labels in the field label"
         raise InputError(source, "masks need images, and a cloud has none", remedy)
@@ -273,8 +264,7 @@ def extract(
     cloud = stored.to_cloud(config.cloud)
     rng = np.random.default_rng(seed)
     cloud = cloud.moved(level_transform(cloud, config, rng, use_labels=use_labels))
-    steps = map(explorer.look, [cloud])
-    return (replace(step, labels=stored.spread(step.labels)) for step in steps)
+    return (replace(step, labels=stored.spread(step.labels)) for step in map(explorer.look, [cloud]))
 
 
 def _viewable(source: str) -> Kind:

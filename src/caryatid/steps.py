@@ -81,7 +81,9 @@ class RunWriter(StagedFolder):
     ) -> None:
         self._about = json.loads(json_text(dict(about) | {"settings": asdict(config)}))
         self.past = _unfinished(Path(folder), self._about) if stepwise else None
-        super().__init__(folder, own=_own_files, published=self.past is not None)
+        super().__init__(
+            folder, own=lambda place: OWN_FILES if is_run(place) else None, published=self.past is not None
+        )
         record = {} if self.past is None else self.past.record
         self.steps: list[dict[str, Any]] = [*record.get("steps", ())]
         self._scores: list[Mapping[str, Any]] = [*record.get("scores", ())]
@@ -316,11 +318,6 @@ def _exists(folder: Path) -> bool:
     if not folder.is_dir():
         recover(folder)
     return folder.is_dir()
-
-
-def _own_files(folder: Path) -> re.Pattern[str] | None:
-    """The files of a run folder that may be replaced."""
-    return OWN_FILES if is_run(folder) else None
 
 
 def _unfinished(folder: Path, about: Mapping[str, Any]) -> Run | None:

@@ -18,16 +18,15 @@ from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io.mask_sources import mask_source, without_ignored
 from caryatid.manipulation.order import plan_order
-from caryatid.planning.candidates import Candidates
+from caryatid.planning.candidates import Candidates, Posture
 from caryatid.planning.decision import Decision
 from caryatid.planning.planners import make_planner
-from caryatid.planning.posture import Posture
 from caryatid.robots import OwnViews, Robot, RobotMaker, Surroundings, Unreachable, find_robot, view_sphere_of
 from caryatid.robots.protocol import refusal_of
 from caryatid.runtime.parallel import cores
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
-from caryatid.sessions.next_view import reached_candidates, table_floor
+from caryatid.sessions.session import reached_candidates, table_floor
 from caryatid_ros import messages
 from caryatid_ros.messages import Make
 

@@ -22,7 +22,7 @@ from caryatid.evaluation.scores import Score, TrueScene, score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
 from caryatid.graph import SupportGraph, TakeStep
-from caryatid.manipulation.dismantling import SimulatedHands, bodies_of
+from caryatid.manipulation.clearing import SimulatedHands, bodies_of
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.planners import offered
 from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, list_scenes, load_scene

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 from caryatid.benchmark.episodes import MEASURES, Episode, Outcome
 from caryatid.errors import InputError, needs_extra
 from caryatid.io.json_files import parse_json
-from caryatid.io.log import Log
+from caryatid.io.staging import Log
 from caryatid.runtime import LIBRARIES
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from caryatid.cli import options
-from caryatid.config.choices import ExportFormat, FusionMethod, NoiseModel, Preset, SegmentationMethod
+from caryatid.config import ExportFormat, FusionMethod, NoiseModel, Preset, SegmentationMethod
 
 SuiteName = Literal[
     "smoke", "fig5", "fig5-paper", "presets", "planners", "path", "ablation", "ablation-attention", "poses",

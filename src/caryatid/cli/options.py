@@ -28,7 +28,7 @@ from typing import (
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from caryatid.config.choices import (
+from caryatid.config import (
     FusionMethod,
     GripperKind,
     MaskIdentity,

@@ -29,8 +29,7 @@ from caryatid.graph import TakeStep, object_id
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.json_files import plain
 from caryatid.io.mask_sources import MaskSource
-from caryatid.manipulation.clearing import clear
-from caryatid.manipulation.dismantling import SimulatedHands
+from caryatid.manipulation.clearing import SimulatedHands, clear
 from caryatid.runtime.parallel import cores
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.sources import Source, extract, is_name, kind_of, open_run, open_source

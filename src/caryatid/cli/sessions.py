@@ -16,8 +16,7 @@ from caryatid.io.json_files import parse_json, read_json
 from caryatid.io.staging import write_errors
 from caryatid.robots import located
 from caryatid.sessions import Capture, Session
-from caryatid.sessions.next_view import CandidateViews
-from caryatid.sessions.session import Moved
+from caryatid.sessions.messages import CandidateViews, Moved
 from caryatid.viz.tables import census, count_of
 
 KEPT = "all views and changes saved so far are kept"
@@ -55,7 +54,7 @@ def plan_view(command: Next) -> None:
                 remedy = "give camera poses to choose from, or those that the robot refuses as 'refused'"
                 raise InputError(command.candidates, "'T_world_camera' is missing", remedy)
             given = parse_json(CandidateViews, document, command.candidates)
-        view = session.next(**given.arguments)
+        view = session.next(given.T_world_camera, given.path_length, refused=given.refused)
     command.output.result(view.to_json())
 
 

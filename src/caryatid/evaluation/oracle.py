@@ -6,6 +6,7 @@ score. No other planner may use the ground truth, so it is not in `caryatid.plan
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -97,7 +98,10 @@ class OraclePlanner:
         best, reached = int(order[0]), -1.0
         equal = 1e-9  # scores are ratios of small integers
         for k in order:
-            f1 = self._f1_after(candidates.T_world_camera[tried[k]])
+            scene, f1 = self._scene.copy(), -1.0  # for a view that cannot be used
+            with suppress(CaryatidError):
+                view = self._simulated.fork().capture(candidates.T_world_camera[tried[k]])
+                f1 = self._f1(scene.update(view))
             if f1 > reached + equal:
                 best, reached = int(k), f1
             if reached > 1.0 - equal:
@@ -121,15 +125,6 @@ class OraclePlanner:
             remedy = "pass its camera to explore(), with the same configuration, segmentation and seed"
             raise InputError(f"planner {ORACLE}", reason, remedy)
 
-    def _f1_after(self, T_world_camera: Array) -> float:
-        """F1 of the fused graph after a view from there, or -1 if that view cannot be used."""
-        scene = self._scene.copy()
-        try:
-            graph = scene.update(self._simulated.fork().capture(T_world_camera))
-        except CaryatidError:
-            return -1.0
-        return self._f1(graph)
-
     def _f1(self, graph: SupportGraph) -> float:
         return score(graph, self._truth, config=self._config.evaluation).f1
 
@@ -146,11 +141,8 @@ class OraclePlanner:
         points_world = T_world_camera[:3, 3] + reach * rays_world[on_object]
         cells = 4096  # along each axis around the world's origin: 41 m
         place = np.floor(points_world / self._config.voxels.size).astype(np.int64) + cells // 2
-        return np.unique(
-            np.ravel_multi_index(
-                (labels[on_object], *np.clip(place, 0, cells - 1).T), (int(labels.max()) + 1, *(cells,) * 3)
-            )
-        )
+        counts = int(labels.max()) + 1, cells, cells, cells
+        return np.unique(np.ravel_multi_index((labels[on_object], *np.clip(place, 0, cells - 1).T), counts))
 
 
 def planner_for(
@@ -174,15 +166,10 @@ def planner_for(
 
 
 def spread_out(directions: Array, visited: Array, count: int) -> NDArray[np.intp]:
-    """Pick directions one by one, each as far as possible from the visited and the picked ones.
+    """Pick up to `count` directions (N, 3) one by one, each as far as possible from the earlier ones.
 
-    Args:
-        directions: Unit vectors (N, 3) to pick from.
-        visited: Unit vectors (V, 3), V ≥ 1.
-        count: Maximum number to pick.
-
-    Returns:
-        Indices (M,), M = min(count, N), each once; the first of equally far ones.
+    These are the visited ones (V, 3), V ≥ 1, and the picked ones. Return indices (M,), each once; the first
+    of equally far ones.
     """
     nearness = (directions @ visited.T).max(axis=1)
     picked = []

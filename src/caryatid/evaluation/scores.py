@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, fields
 from typing import Final, NamedTuple
@@ -134,9 +135,20 @@ def score(
         config: Minimum IoU, tolerance of the table's height, points per pair.
     """
     config = config or EvaluationConfig()
-    shapes = [o.shape for o in graph.objects if o.role == "object"]
     rng = rng or np.random.default_rng(0)
-    iou = _volume_ious(shapes, list(truth.objects.values()), config.samples, rng)
+    found, true = [o.shape for o in graph.objects if o.role == "object"], list(truth.objects.values())
+    # By Monte Carlo; 10,000 points per pair: σ = 0.01 at worst.
+    iou, true_bounds = np.zeros((len(found), len(true))), [_bounds(shape) for shape in true]
+    for i, a in enumerate(found):
+        low_a, high_a = _bounds(a)
+        for j, (b, (low_b, high_b)) in enumerate(zip(true, true_bounds, strict=True)):
+            if (np.maximum(low_a, low_b) >= np.minimum(high_a, high_b)).any():
+                continue
+            start, end = np.minimum(low_a, low_b), np.maximum(high_a, high_b)
+            points_world = rng.uniform(start, end, size=(config.samples, 3))
+            in_a, in_b = _inside(a, points_world), _inside(b, points_world)
+            union = int(np.count_nonzero(in_a | in_b))
+            iou[i, j] = np.count_nonzero(in_a & in_b) / union if union else 0.0
     same = abs(_top_height(graph) - truth.table_top) <= config.table_tolerance
     table = truth.table if same else None
     return _matched(graph, truth.vertices, truth.edges, iou, list(truth.objects), table, config.min_iou)
@@ -169,7 +181,9 @@ def score_masks(
     config = config or EvaluationConfig()
     names = [name for name in vertices if name != TABLE]
     found = [o.label for o in graph.objects if o.role == "object"]
-    iou = mask_ious(labels, true_labels, found, [_object_number(name) for name in names])
+    # Other names than `object<obj_id>` are of no object, like the label 0.
+    numbered = [re.fullmatch("object([0-9]+)", name) for name in names]
+    iou = mask_ious(labels, true_labels, found, [int(n[1]) if n else 0 for n in numbered])
     table = TABLE if TABLE in vertices else None
     return _matched(graph, vertices, edges, iou, names, table, config.min_iou)
 
@@ -214,13 +228,8 @@ def _matched(
 def average_precision(forecasts: Sequence[Forecast]) -> float:
     """Sum of precision times gain in recall, as the probability threshold falls from 1 to above 0.
 
-    Equal probabilities form one step. A support with probability 0 is never found.
-
-    Args:
-        forecasts: The forecasts of supports.
-
-    Returns:
-        In [0, 1]; 1 if there is nothing to find and nothing is found, 0 if only false ones are found.
+    Equal probabilities form one step. A support with probability 0 is never found. Without any to find, the
+    result is 1 if nothing is found, and 0 otherwise.
     """
     said, true = np.array(forecasts, dtype=np.float64).reshape(-1, 2).T
     order = np.argsort(-said, kind="stable")[: np.count_nonzero(said)]
@@ -229,25 +238,6 @@ def average_precision(forecasts: Sequence[Forecast]) -> float:
     if not true.any():
         return float(len(steps) == 0)
     return float(np.diff(hits, prepend=0.0) @ (hits / (steps + 1)) / true.sum())
-
-
-def _volume_ious(
-    found: Sequence[Shape], true: Sequence[Shape], samples: int, rng: np.random.Generator
-) -> Array:
-    """Intersection over union (F, T) of shapes by Monte Carlo; 10,000 points per pair: σ = 0.01 at worst."""
-    iou = np.zeros((len(found), len(true)))
-    true_bounds = [_bounds(shape) for shape in true]
-    for i, a in enumerate(found):
-        low_a, high_a = _bounds(a)
-        for j, (b, (low_b, high_b)) in enumerate(zip(true, true_bounds, strict=True)):
-            if (np.maximum(low_a, low_b) >= np.minimum(high_a, high_b)).any():
-                continue
-            start, end = np.minimum(low_a, low_b), np.maximum(high_a, high_b)
-            points_world = rng.uniform(start, end, size=(samples, 3))
-            in_a, in_b = _inside(a, points_world), _inside(b, points_world)
-            union = int(np.count_nonzero(in_a | in_b))
-            iou[i, j] = np.count_nonzero(in_a & in_b) / union if union else 0.0
-    return iou
 
 
 def _inside(shape: Shape, points_world: Array) -> NDArray[np.bool_]:
@@ -274,11 +264,7 @@ def mask_ious(
 ) -> Array:
     """Intersection over union (F, T) of masks, the pixels of all frames pooled.
 
-    Args:
-        labels: Label images (H, W), or labels of points (N,).
-        true_labels: The true ones, (H, W) or (N,) as those.
-        found: F label numbers in `labels`.
-        true: T label numbers in `true_labels`; numbers that belong to no object match nothing.
+    Labels are images (H, W), or of points (N,). Numbers that belong to no object match nothing.
 
     Raises:
         InputError: Images differ in number or size.
@@ -333,12 +319,6 @@ def _ratios(right: int, claimed: int, true: int) -> tuple[float, float]:
 
 def _harmonic_mean(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b > 0.0 else 0.0
-
-
-def _object_number(name: str) -> int:
-    """Label of a vertex `object<obj_id>`; 0, which is not an object, for any other name."""
-    digits = name.removeprefix("object")
-    return int(digits) if name.startswith("object") and digits.isascii() and digits.isdigit() else 0
 
 
 def _order(image: NDArray[np.int32], labels: Sequence[int]) -> NDArray[np.intp]:

@@ -11,7 +11,6 @@ import numpy as np
 from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.scores import Score, TrueScene, score, score_masks
-from caryatid.geometry.transforms import Array
 from caryatid.io.bop import read_recording
 from caryatid.io.datasets import find_sample
 from caryatid.simulation.lifting import ASIDE
@@ -45,8 +44,7 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
     shapes = true_shapes(scene)
     objects = {name: shapes[labels[name]] for name in truth.vertices if name != scene.table}
     table = scene.table if scene.table in truth.vertices else None
-    height = float(table_centre(scene)[2])
-    return TrueScene(truth.vertices, frozenset(truth.pairs), objects, table, height)
+    return TrueScene(truth.vertices, frozenset(truth.pairs), objects, table, float(table_centre(scene)[2]))
 
 
 def evaluate_run(
@@ -67,7 +65,11 @@ def evaluate_run(
         InputError: The run or the truth is missing or broken, or they do not fit each other.
     """
     run = run_folder if isinstance(run_folder, Run) else read_run(run_folder)
-    source = str(_source_of(run) if truth is None else truth)
+    if truth is None:  # where the run's source lies from its folder, or else as typed
+        truth, path = run.record["source"], run.record.get("source_path")
+        place = (run.folder.resolve() / path).resolve() if path else None
+        truth = place if place is not None and place.exists() else truth
+    source = str(truth)
     folder = find_sample(source)
     if is_builtin(source) or (folder / SCENE_FILE).is_file() or folder.suffix == ".xml":
         scores = [
@@ -85,9 +87,7 @@ def evaluate_run(
             for n, view in enumerate(run.views, 1)
         ]
     else:
-        why = "no such scene or recording"
-        if folder.exists():
-            why = "neither a scene nor a recording"
+        why = "neither a scene nor a recording" if folder.exists() else "no such scene or recording"
         remedy = "give a scene (scene.xml), or a recording with scene_camera.json and gt.json"
         raise InputError(source, why, remedy)
     if not scores[-1].ious and len(run.views[-1].graph.objects) > 1:
@@ -97,35 +97,23 @@ def evaluate_run(
     return tuple(scores)
 
 
-def _source_of(run: Run) -> str | Path:
-    """The run's own source: where it lies from the run folder, or else as typed."""
-    typed, path = run.record["source"], run.record.get("source_path")
-    place = (run.folder.resolve() / path).resolve() if path else None
-    return place if place is not None and place.exists() else str(typed)
-
-
 def _truths(run: Run, scene: SimulatedScene) -> Iterator[TrueScene]:
     """The truth at each view; a graph that lacks the object lifted after its view is that after the lift."""
     lifts = {lift["view"]: lift for lift in run.record.get("lifts", ())}
-    true = true_scene_from_simulation(scene)
+    true, names = true_scene_from_simulation(scene), list(scene.object_bodies.values())
     for number, view in enumerate(run.views):
         lift, after = lifts.get(number), true
         if lift is not None:
-            after = _truth_after(scene, np.array(lift["state"]))
+            state = np.array(lift["state"])
+            if state.shape != (len(names), 7):
+                reason = f"has {len(names)} objects, but the run removed objects from {len(state)}"
+                raise InputError(scene.source, reason, "give the scene of this run")
+            lifted = posed(scene, state)
+            gone = {name for name, z in zip(names, state[:, 2], strict=True) if z >= ASIDE / 2.0}
+            known = ground_truth(lifted)
+            vertices = tuple(name for name in known.vertices if name not in gone)
+            edges = tuple(edge for edge in known.edges if not {edge.supporter, edge.supported} & gone)
+            after = true_scene_from_simulation(lifted, GroundTruth(vertices, edges))
         lacks = lift is not None and all(o.id != lift["object"] for o in view.graph.objects)
         yield after if lacks else true
         true = after
-
-
-def _truth_after(scene: SimulatedScene, state: Array) -> TrueScene:
-    """The truth of the objects of a scene that are not put aside, in a state (N, 7)."""
-    names = list(scene.object_bodies.values())
-    if state.shape != (len(names), 7):
-        reason = f"has {len(names)} objects, but the run removed objects from {len(state)}"
-        raise InputError(scene.source, reason, "give the scene of this run")
-    scene = posed(scene, state)
-    gone = {name for name, z in zip(names, state[:, 2], strict=True) if z >= ASIDE / 2.0}
-    known = ground_truth(scene)
-    vertices = tuple(name for name in known.vertices if name not in gone)
-    edges = tuple(edge for edge in known.edges if not {edge.supporter, edge.supported} & gone)
-    return true_scene_from_simulation(scene, GroundTruth(vertices, edges))

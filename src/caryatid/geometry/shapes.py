@@ -19,7 +19,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import BOX, CYLINDER, SPHERE, polygons, transforms
 from caryatid.geometry.signed_distance import distances_and_gradients, sample_surface, signed_distances
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.display import Pictured
+from caryatid.runtime import Pictured
 
 _BOX_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 """Corners (8, 3) of a box, in half extents."""

@@ -66,11 +66,19 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     if options.world is None:
         notes.append("no --tf FRAME: poses are unknown, so only one frame is imported")
     else:
-        tree = _read_transforms(bag, config.pose_gap)
+        tree = TransformTree(config.pose_gap)
+        for topic, received, message in bag.messages(bag.topics("transforms")):
+            for item in message.transforms:
+                t, q = item.transform.translation, item.transform.rotation
+                pose, time = (t.x, t.y, t.z, q.x, q.y, q.z, q.w), _stamp(item.header, received)
+                if is_pose(pose):
+                    parent, child = _frame(item.header.frame_id), _frame(item.child_frame_id)
+                    tree.add(parent, child, time, pose, fixed=topic.endswith("tf_static"))
+        if not tree.frames:
+            raise InputError(bag.path, "has no transforms", "record /tf and /tf_static, or omit --tf")
         for frame in dict.fromkeys([options.world, *(depth.frame for depth in depths)]):
             if frame not in tree.frames:
-                known = f"known frames: {', '.join(tree.frames)}"
-                raise InputError(path, f"unknown frame '{frame}'", known)
+                raise InputError(path, f"unknown frame '{frame}'", f"known frames: {', '.join(tree.frames)}")
         pose_at = partial(tree.between, options.world)
     if distorts:
         notes.append("the lens has distortion, but a pinhole camera is assumed: use rectified topics")
@@ -154,20 +162,6 @@ def _read_cameras(bag: _Bag, topic: str) -> tuple[list[TimedCamera], bool]:
     if not cameras:
         raise InputError(bag.path, f"'{topic}' has no messages", "record the camera info too")
     return cameras, distorts
-
-
-def _read_transforms(bag: _Bag, max_gap: float) -> TransformTree:
-    tree = TransformTree(max_gap)
-    for topic, received, message in bag.messages(bag.topics("transforms")):
-        for item in message.transforms:
-            t, q = item.transform.translation, item.transform.rotation
-            pose, time = (t.x, t.y, t.z, q.x, q.y, q.z, q.w), _stamp(item.header, received)
-            if is_pose(pose):
-                parent, child = _frame(item.header.frame_id), _frame(item.child_frame_id)
-                tree.add(parent, child, time, pose, fixed=topic.endswith("tf_static"))
-    if not tree.frames:
-        raise InputError(bag.path, "has no transforms", "record /tf and /tf_static, or omit --tf")
-    return tree
 
 
 def _frame(name: str) -> str:

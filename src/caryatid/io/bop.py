@@ -44,9 +44,8 @@ Masks = tuple[tuple[Path, int], ...]
 
 def recognises(path: Path) -> bool:
     """Whether a path is a scene folder."""
-    return (path / "scene_camera.json").is_file() or (
-        (path / "depth").is_dir() and not (path / "depth.txt").exists()
-    )
+    has_depth = (path / "depth").is_dir() and not (path / "depth.txt").exists()
+    return has_depth or (path / "scene_camera.json").is_file()
 
 
 def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> Dataset:

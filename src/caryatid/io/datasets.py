@@ -165,5 +165,4 @@ def open_dataset(
         bags = "a bag (.bag, .mcap, .db3, or a folder with metadata.yaml)"
         remedy = f"give a BOP scene folder, {bags}, or a TUM RGB-D folder with depth.txt"
         raise InputError(path, "unknown format" if path.exists() else "no such file or folder", remedy)
-    dataset: Dataset = known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())
-    return dataset
+    return known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())

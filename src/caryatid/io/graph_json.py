@@ -55,9 +55,8 @@ class _Object:
     def decoded(self, source: str) -> SceneObject:
         source = f"{source} ('{self.id}')"
         lengths = self.size.values() if isinstance(self.size, dict) else self.size
-        if self.shape != Solid.kind and not all(
-            isinstance(length, float) and length > 0.0 for length in lengths
-        ):
+        positive = all(isinstance(length, float) and length > 0.0 for length in lengths)
+        if self.shape != Solid.kind and not positive:
             raise InputError(source, f"size {self.size} is not positive", "give sizes in metres")
         given = dict(vars(self))
         given["shape"] = from_size(self.shape, given.pop("T_world_object"), given.pop("size"), source)
@@ -99,12 +98,9 @@ class _Graph:
 
 
 def graph_to_json(graph: SupportGraph) -> dict[str, Any]:
-    """Write a graph as the document of graph.json.
+    """Write a graph as the document of graph.json: plain dicts, lists, texts and numbers.
 
     Keys come in a fixed order and floats are rounded to a nanometre, so the same graph gives the same bytes.
-
-    Returns:
-        Plain dicts, lists, texts and numbers.
     """
     objects = []
     for o in graph.objects:
@@ -126,8 +122,7 @@ def graph_to_json(graph: SupportGraph) -> dict[str, Any]:
             id_: asdict(verdict) | ({} if isfinite(verdict.overhang) else {"overhang": None})
             for id_, verdict in sorted(graph.stability.items())
         }
-    result: dict[str, Any] = plain(document)
-    return result
+    return plain(document)
 
 
 def graph_text(graph: SupportGraph) -> str:
@@ -162,8 +157,7 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
     known = {*ids}
     for named in (*(i for pair in pairs for i in pair), *given.stability):
         if named not in known:
-            there = f"known objects: {', '.join(ids) or 'none'}"
-            raise InputError(name, f"unknown object '{named}'", there)
+            raise InputError(name, f"unknown object '{named}'", f"known objects: {', '.join(ids) or 'none'}")
     return SupportGraph(
         tuple(o.decoded(name) for o in given.objects),
         tuple(Support(*vars(s).values()) for s in given.supports),

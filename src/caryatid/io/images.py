@@ -115,8 +115,7 @@ def read_npy(array: Path | bytes, name: str = "") -> NDArray[Any]:
     except OSError as error:
         raise InputError(source, f"cannot be read ({error.strerror or error})", "give a .npy file") from None
     except Exception:  # NumPy parses the header as Python, so a damaged one raises almost anything
-        reason = "is not a valid .npy of numbers"
-        raise InputError(source, reason, "save it with numpy.save") from None
+        raise InputError(source, "is not a valid .npy of numbers", "save it with numpy.save") from None
 
 
 def npy(array: NDArray[Any]) -> bytes:

@@ -91,10 +91,8 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
     """Choose sharp frames of a video, each from another viewpoint; single images count as sharp.
 
     Sharpness is the variance of the Laplacian of the brightness. Without colour it is the share of pixels
-    with a reading, because a moving depth camera loses readings at edges.
-
-    Returns:
-        The dataset with the chosen frames, ordered by time; the others count as skipped.
+    with a reading, because a moving depth camera loses readings at edges. The chosen frames are ordered by
+    time; the others count as skipped.
 
     Raises:
         InputError: No frame can become a view.
@@ -122,8 +120,7 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
         raise InputError(dataset.path, "has no depth images", remedy)
     if not usable:
         reason = f"none of its {skipped.total()} depth images is usable: {reasons(skipped)}"
-        remedy = _REMEDIES.get(skipped.most_common(1)[0][0], "record it again")
-        raise InputError(dataset.path, reason, remedy)
+        raise InputError(dataset.path, reason, _REMEDIES.get(skipped.most_common(1)[0][0], "record it again"))
     times = np.array([(frame.time - usable[0].time) / SECOND for frame in usable])
     poses = [frame.T_world_camera for frame in usable if frame.T_world_camera is not None]
     T_world_camera = np.stack(poses) if len(poses) == len(usable) else None
@@ -141,10 +138,8 @@ def choose_views(
     ones. If there are too many, those farthest from each other stay.
 
     Frames have ascending times (N,) [s], N > 0, sharpness (N,), of which only ratios count, and poses
-    (N, 4, 4). Without poses, a single frame is chosen.
-
-    Returns:
-        Indices of the chosen frames, ascending, and the number of others by reason.
+    (N, 4, 4). Without poses, a single frame is chosen. Return the indices of the chosen ones, ascending, and
+    the number of others by reason.
     """
     if T_world_camera is None:
         return [int(np.argmax(sharpness))], dict(+Counter({SPARE: len(times) - 1}))
@@ -161,7 +156,12 @@ def choose_views(
         best = candidates[soon][np.argmax(sharpness[candidates[soon]])]
         chosen.append(int(best))
         free &= _apart(T_world_camera[candidates], T_world_camera[best], config) > 1.0
-    kept = _farthest(T_world_camera[chosen], config)
+    # Of too many, the first stays, and then always the one farthest from those that stay.
+    kept, poses = [0], T_world_camera[chosen]
+    gap = _apart(poses, poses[0], config)
+    while len(kept) < min(config.max_views, len(poses)):
+        kept.append(int(np.argmax(gap)))
+        gap = np.minimum(gap, _apart(poses, poses[kept[-1]], config))
     others = Counter({"blurred": len(times) - len(candidates), SPARE: len(chosen) - len(kept)})
     others["same viewpoint as another view"] = len(candidates) - len(chosen)
     return sorted(chosen[i] for i in kept), dict(+others)
@@ -219,13 +219,3 @@ def _apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig)
     distance = np.linalg.norm(T_world_camera[:, :3, 3] - T_world_other[:3, 3], axis=1)
     turns = Rotation.from_matrix(T_world_other[:3, :3].T @ T_world_camera[:, :3, :3])
     return np.maximum(distance / config.min_distance, np.degrees(turns.magnitude()) / config.min_angle)
-
-
-def _farthest(T_world_camera: Array, config: RecordingConfig) -> list[int]:
-    """Indices of up to `max_views` poses: the first, then always the one farthest from those chosen."""
-    kept = [0]
-    gap = _apart(T_world_camera, T_world_camera[0], config)
-    while len(kept) < min(config.max_views, len(T_world_camera)):
-        kept.append(int(np.argmax(gap)))
-        gap = np.minimum(gap, _apart(T_world_camera, T_world_camera[kept[-1]], config))
-    return kept

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -39,29 +39,26 @@ def Numbers(*shape: int, rigid: bool = False) -> GetPydanticSchema:
         schema = {"type": "array", "items": schema}
         if size >= 0:
             schema |= {"minItems": size, "maxItems": size}
-    read = partial(_read_numbers, shape, rigid)
-    return GetPydanticSchema(
-        lambda _, __: core_schema.no_info_plain_validator_function(read), lambda _, __: schema
-    )
 
+    def read(value: Any) -> Array:
+        try:
+            array = np.array(value)
+        except ValueError:
+            array = np.array("lists of different lengths")
+        if array.size == 0 and shape[0] < 0:
+            array = array.reshape(0, *shape[1:])
+        same = array.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
+        if not same or array.dtype.kind not in "if" or not (np.abs(array) <= LARGEST).all():
+            sizes = "×".join("N" if n < 0 else str(n) for n in shape)
+            raise ValueError(f"must be {sizes} finite numbers")
+        array = array.astype(np.float64)
+        try:
+            return transforms.as_rigid(array, "") if rigid else array
+        except InputError as error:
+            raise ValueError(error.reason) from None
 
-def _read_numbers(shape: tuple[int, ...], rigid: bool, value: Any) -> Array:
-    """Turn nested lists into an array (...); raise a ValueError if it is not what `Numbers` asks for."""
-    try:
-        array = np.array(value)
-    except ValueError:
-        array = np.array("lists of different lengths")
-    if array.size == 0 and shape[0] < 0:
-        array = array.reshape(0, *shape[1:])
-    same = array.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
-    if not same or array.dtype.kind not in "if" or not (np.abs(array) <= LARGEST).all():
-        sizes = "×".join("N" if n < 0 else str(n) for n in shape)
-        raise ValueError(f"must be {sizes} finite numbers")
-    array = array.astype(np.float64)
-    try:
-        return transforms.as_rigid(array, "") if rigid else array
-    except InputError as error:
-        raise ValueError(error.reason) from None
+    validator = core_schema.no_info_plain_validator_function(read)
+    return GetPydanticSchema(lambda _, __: validator, lambda _, __: schema)
 
 
 def parse_json(
@@ -77,12 +74,11 @@ def parse_json(
     try:
         if not _largest(document) <= LARGEST:
             raise ValueError(f"a number is larger than {LARGEST:.2g}")
-        read: T = _adapter(kind).validate_json(json.dumps(document, allow_nan=False), strict=True)
+        return _adapter(kind).validate_json(json.dumps(document, allow_nan=False), strict=True)
     except ValidationError as error:
         raise InputError(str(source), _sentence(error.errors()[0]), remedy) from None
     except (ValueError, RecursionError) as error:
         raise InputError(str(source), f"cannot be read ({error})", remedy) from None
-    return read
 
 
 def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any]:

@@ -97,8 +97,13 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
         if points is None or any(columns[axis].dtype.kind != "f" for axis in "xyz"):
             raise ValueError("no floating-point fields x y z")
     except Exception as error:
-        reason = f"broken file or header: {_reason(error)}"
-        raise InputError(path, reason, "export the cloud again") from error
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        if hasattr(error, "errors"):
+            first = error.errors()[0]
+            reason = f"{str(first['loc'][0]).upper()}: {first['msg'].lower()}"
+        elif isinstance(error, KeyError):
+            reason = f"no {error}"
+        raise InputError(path, f"broken file or header: {reason}", "export the cloud again") from error
     normals = _triple(columns, "normal_x normal_y normal_z", "nx ny nz")
     labels = _labels(columns, label_divisor, path)
     stored = StoredCloud(points, normals, labels, _colours(columns), viewpoint, path.name)
@@ -159,16 +164,6 @@ def _parse_ply(content: bytes) -> tuple[Columns, Array]:
     if any(len(column) != vertex["length"] for column in columns.values()):
         raise ValueError(f"fewer than {vertex['length']} points")
     return columns, np.zeros(3)
-
-
-def _reason(error: Exception) -> str:
-    """A library's error in one line."""
-    if hasattr(error, "errors"):
-        first = error.errors()[0]
-        return f"{str(first['loc'][0]).upper()}: {first['msg'].lower()}"
-    if isinstance(error, KeyError):
-        return f"no {error}"
-    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _triple(columns: Columns, *choices: str) -> Array | None:

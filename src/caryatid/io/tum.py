@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
@@ -65,8 +66,16 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     decode = partial(images.decode_image, **limit)
     colours = _read_list(path / "rgb.txt", decode) if (path / "rgb.txt").is_file() else None
     pose_at, notes = None, [note]
-    if (path / "groundtruth.txt").is_file():
-        pose_at = partial(_read_poses(path / "groundtruth.txt", config.pose_gap).between, _WORLD)
+    poses = path / "groundtruth.txt"
+    if poses.is_file():
+        tree = TransformTree(config.pose_gap)
+        for time, words in _read_rows(poses, 8):
+            with suppress(ValueError):
+                if is_pose(pose := [float(word) for word in words]):
+                    tree.add(_WORLD, _CAMERA, time, pose)
+                    continue
+            raise _broken(poses, f"'{' '.join(words)}' is not a pose")
+        pose_at = partial(tree.between, _WORLD)
     else:
         notes.append("no groundtruth.txt: poses are unknown, so only one frame is imported")
     return make_video(path, depths, colours, [camera], pose_at, config, notes)
@@ -83,19 +92,6 @@ def _read_camera(folder: Path, camera_file: Path | None) -> tuple[_CameraFile, t
             return _CameraFile(fx, fy, cx, cy), (640, 480), note
     reason = f"the camera is unknown: the folder's name contains none of {', '.join(PUBLISHED)}"
     raise InputError(folder, reason, 'give --camera FILE.json with {"fx": …, "fy": …, "cx": …, "cy": …}')
-
-
-def _read_poses(path: Path, max_gap: float) -> TransformTree:
-    tree = TransformTree(max_gap)
-    for time, words in _read_rows(path, 8):
-        try:
-            pose = [float(word) for word in words]
-        except ValueError:
-            pose = []
-        if not is_pose(pose):
-            raise _broken(path, f"'{' '.join(words)}' is not a pose")
-        tree.add(_WORLD, _CAMERA, time, pose)
-    return tree
 
 
 def _read_list(path: Path, read: Callable[[Path], NDArray[Any]]) -> list[TimedImage]:

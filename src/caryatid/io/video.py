@@ -67,10 +67,7 @@ def make_video(
     """Find the colour, camera and pose of each depth image; they are numbered in their order here.
 
     `pose_at` gives the pose (4, 4) of a frame at a time [ns], or None if it is unknown. Without it, views
-    have no poses, and without `colours` no colour.
-
-    Returns:
-        The complete frames, ordered by time, and the number of others by reason.
+    have no poses, and without `colours` no colour. Complete frames are ordered by time, others are counted.
     """
     frames, skipped = [], Counter[str]()
     by_time = attrgetter("time")
@@ -185,9 +182,7 @@ class TransformTree:
         """`T_target_source` (4, 4): the pose of one frame in another at a time [ns].
 
         Between two poses the rotation is interpolated along the shortest arc and the translation linearly.
-
-        Returns:
-            None if the frames are not connected, or a link has no pose around that time.
+        None if the frames are not connected, or a link has no pose around that time.
         """
         T_up_source = dict(self._upwards(source, time))
         for frame, T_frame_target in self._upwards(target, time):

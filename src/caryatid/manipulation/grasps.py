@@ -51,7 +51,7 @@ def find_grasp(
     voxels: VoxelMap | None = None,
     reachable: Reachable | None = None,
 ) -> Grasp | Blocked:
-    """Find the best grasp of an object that nothing obstructs.
+    """Find the best grasp of an object that nothing obstructs, or say why there is none.
 
     Grasps nearer to the centre of mass and more downward are better.
 
@@ -63,9 +63,6 @@ def find_grasp(
         voxels: What was seen empty; None = only known shapes obstruct.
         reachable: Which gripper poses (N, 4, 4), in the world frame, the arm reaches; None = all. The arm has
             to reach the grasp, the start of its approach, and the end of the lift.
-
-    Returns:
-        The grasp, or why there is none.
     """
     jaw = gripper.kind == "parallel"
     found = list(_antipodal(shape, gripper, friction) if jaw else _flat(shape, gripper))
@@ -86,9 +83,13 @@ def find_grasp(
     near = {i: o for i, o in others.items() if _near(o, shape, gripper)}
     fewest, unseen = None, False
     for k in np.argsort(arm + lean, kind="stable").tolist():
-        swept = transforms.transform(poses[k], _volume(gripper, widths[k], gripper.travel))
-        risen = transforms.transform(poses[k], _volume(gripper, widths[k], 0.0))
-        path = np.concatenate([swept, *(risen + [0.0, 0.0, h] for h in _rise(poses[k], gripper))])
+        swept, risen = (
+            transforms.transform(poses[k], _volume(gripper, widths[k], travel))
+            for travel in (gripper.travel, 0.0)
+        )
+        # The heights [m] of the lift that the approach does not cover, 1 cm apart.
+        top = 0.0 if -poses[k, 2, 2] > 1.0 - 1e-6 else gripper.travel + 1e-9
+        path = np.concatenate([swept, *(risen + [0.0, 0.0, h] for h in np.arange(0.01, top, 0.01))])
         if (shape.signed_distance(swept) < 0.0).any():
             continue
         by = tuple(i for i, o in near.items() if (o.signed_distance(path) < gripper.clearance).any())
@@ -195,12 +196,6 @@ def _volume(gripper: GripperConfig, width: float, travel: float) -> Array:
         ]
         points.append(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
     return np.concatenate(points)
-
-
-def _rise(T: Array, gripper: GripperConfig) -> Array:
-    """Heights (N,) [m] of the lift that its approach does not cover, 1 cm apart."""
-    straight = -T[2, 2] > 1.0 - 1e-6
-    return np.zeros(0) if straight else np.arange(0.01, gripper.travel + 1e-9, 0.01)
 
 
 def _near(other: Shape, shape: Shape, gripper: GripperConfig) -> bool:

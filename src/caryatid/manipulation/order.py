@@ -30,12 +30,12 @@ from scipy.sparse.csgraph import connected_components
 from caryatid.config import Config, LiftConfig
 from caryatid.errors import GoalError, InputError, check_type
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Primitives, Shape
+from caryatid.geometry.shapes import Box, Primitives
 from caryatid.geometry.transforms import Array
 from caryatid.graph import LIKELY, Grasp, SupportGraph, TakeStep
 from caryatid.manipulation.grasps import Blocked, find_grasp
 from caryatid.robots.arm import Reachable
-from caryatid.runtime.display import Pictured
+from caryatid.runtime import Pictured
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.simulation.lifting import ASIDE, Lift, Lifting
 from caryatid.simulation.world import TABLE, Body, add_body, empty_spec, quaternion, strayed
@@ -283,7 +283,12 @@ class _Rehearsal:
         self.ids = tuple(o.id for o in graph.objects if o.role == "object")
         if not self.ids:
             raise InputError("graph", "has no objects to remove", "give a graph with objects")
-        self._groups = _groups([graph[i].shape for i in self.ids], 2.0 * config.lift.moved)
+        # Objects whose bounds, seen from above, are nearer than this gap form a group: a lift that moves no
+        # object by more than half the gap has no effect on another group.
+        gap = 2.0 * config.lift.moved
+        low, high = (side[:, :2] for side in Primitives.of([graph[i].shape for i in self.ids]).bounds())
+        near = ((low[:, None] <= high + gap) & (low <= high[:, None] + gap)).all(axis=-1)
+        self._groups: NDArray[np.int32] = np.asarray(connected_components(near, directed=False)[1])
         largest = int(np.bincount(self._groups).max())
         if largest > config.rehearsal.max_objects:
             reserved = 0.6 * (largest / 300) ** 1.7  # two arenas [GB], measured with 300 and 1,000
@@ -343,15 +348,10 @@ class _Rehearsal:
         if object_id not in self._grasps:
             gone = {trial.object_id for trial in self._taken} | {object_id}
             others = {o.id: o.shape for o in self.graph.objects if o.id not in gone}
-            friction = self._config.support.friction[0]
-            self._grasps[object_id] = find_grasp(
-                self.graph[object_id].shape,
-                others,
-                self._config.gripper,
-                friction,
-                voxels=self._voxels,
-                reachable=self._reachable,
-            )
+            gripper, friction = self._config.gripper, self._config.support.friction[0]
+            known: Any = {"voxels": self._voxels, "reachable": self._reachable}
+            shape = self.graph[object_id].shape
+            self._grasps[object_id] = find_grasp(shape, others, gripper, friction, **known)
         return self._grasps[object_id]
 
     def _tried(self, object_id: str, hold: tuple[str, ...]) -> _Trial:
@@ -361,7 +361,12 @@ class _Rehearsal:
         ids = self._near(group)
         supports = [self.graph.support(object_id, i) if i in free else None for i in ids]
         loses = np.array([0.0 if s is None else s.belief for s in supports])
-        moved = {i: p for i, p in self._moved(object_id, ids).items() if i in free}
+        left = set(self.left()) & set(ids)
+        objects = tuple(o for o in self.graph.objects if o.id in left or o.role == "support_surface")
+        kept = {o.id for o in objects}
+        part = SupportGraph(objects, tuple(s for s in self.graph.supports if {*s.pair} <= kept))
+        effects = predict_removal(part, object_id, self._config.support)
+        moved = {e.object_id: e.probability for e in effects if e.object_id in free}
         doubt = max(moved.values(), default=0.0)  # What falls, falls together.
         accepted, most = self.accepted, self._config.rehearsal.draws
         found, harm, risk, least = list[Array](), np.zeros(0), 1.0, 0.0
@@ -376,15 +381,6 @@ class _Rehearsal:
         shares = zip(ids, np.mean(found, axis=0).tolist(), strict=True)
         rehearsed = {i: share for i, share in shares if share > 0.0}
         return _Trial(object_id, hold, harm, doubt, risk, rehearsed, moved)
-
-    def _moved(self, object_id: str, ids: Sequence[str]) -> dict[str, float]:
-        """Probability that each of some objects moves by the graph without one of them, by id."""
-        left = set(self.left()) & set(ids)
-        objects = tuple(o for o in self.graph.objects if o.id in left or o.role == "support_surface")
-        kept = {o.id for o in objects}
-        supports = tuple(s for s in self.graph.supports if {*s.pair} <= kept)
-        effects = predict_removal(SupportGraph(objects, supports), object_id, self._config.support)
-        return {e.object_id: e.probability for e in effects}
 
     def take(self, trial: _Trial) -> None:
         """Continue without an object whose lift was tried; others that moved are put back."""
@@ -426,16 +422,6 @@ class _Rehearsal:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _groups(shapes: Sequence[Shape], gap: float) -> NDArray[np.int32]:
-    """Group (N,) of each of N shapes: those whose bounds, seen from above, are nearer than a gap [m].
-
-    A lift that moves no object by more than half the gap has no effect on another group.
-    """
-    low, high = (side[:, :2] for side in Primitives.of(shapes).bounds())
-    near = ((low[:, None] <= high + gap) & (low <= high[:, None] + gap)).all(axis=-1)
-    return np.asarray(connected_components(near, directed=False)[1])
-
-
 class _DrawnScene:
     """The table and a group of bodies at rest, and what is left of them.
 
@@ -448,7 +434,11 @@ class _DrawnScene:
         spec = empty_spec("rehearsal")
         # Twice MuJoCo's default time step, which the implicit integrator allows, for half the time.
         spec.option.timestep = 0.004
-        _add_table(spec, table)
+        # The table is as large as it was seen: what is beyond its edge falls. It is slippery: contacts
+        # use the larger friction of two, and it must not hide how slippery objects are.
+        T = table.T_world_object
+        top = spec.worldbody.add_body(name=TABLE, pos=T[:3, 3], quat=quaternion(T[:3, :3]))
+        top.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=table.extents / 2.0, friction=[0.1, 0.005, 0.001])
         names = [str(number) for number in range(len(bodies))]  # MuJoCo does not allow every id as a name
         for name, body in zip(names, bodies.values(), strict=True):
             add_body(spec, name, body)
@@ -508,13 +498,3 @@ def _drawn_bodies(
     return Box(table.T_world_object @ shift, extents), {
         o.id: Body(o.shape, density, friction) for o, density, friction in made
     }
-
-
-def _add_table(spec: Any, table: Box) -> None:
-    """The table, as large as it was seen: what is beyond its edge falls.
-
-    It is slippery: contacts use the larger friction of two, and it must not hide how slippery objects are.
-    """
-    T = table.T_world_object
-    body = spec.worldbody.add_body(name=TABLE, pos=T[:3, 3], quat=quaternion(T[:3, :3]))
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=table.extents / 2.0, friction=[0.1, 0.005, 0.001])

@@ -16,10 +16,9 @@ from caryatid.errors import PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.planning.candidates import Candidates, Looks
+from caryatid.planning.candidates import Candidates, Looks, Posture
 from caryatid.planning.points_of_interest import PointOfInterest
-from caryatid.planning.posture import Posture
-from caryatid.runtime.display import Pictured
+from caryatid.runtime import Pictured
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.voxel_map import VoxelMap
@@ -142,8 +141,7 @@ def path_cost(state: PlanningState) -> Array:
     """
     match state.config.path_cost:
         case "angle":
-            alpha = transforms.angle_between(state.visited[-1], state.candidates.directions)
-            return np.sin(alpha / 2.0)
+            return np.sin(transforms.angle_between(state.visited[-1], state.candidates.directions) / 2.0)
         case "path":
             return state.candidates.path_length / (2.0 * state.sphere.radius)
         case "none":
@@ -162,14 +160,9 @@ def decide(
 ) -> Decision:
     """Choose the view with the largest c = s − h, eq. 3; the first in case of a tie.
 
-    Args:
-        candidates: The views that can be reached.
-        saliency: s (C,) of each scored view.
-        cost: h (C,) of each.
-        why: Returns the reason for one of these.
-        looks: Which of the candidates were scored, and represent the others; None = all.
-        points: The points considered.
-        elsewhere: Returns s (M,) of the points of the view sphere, as a new array, without the candidates.
+    Saliency s (C,), cost h (C,) and the reason are those of the candidates in `looks`, which represent the
+    others; None = all. `elsewhere` returns s (M,) of the points of the view sphere, as a new array, without
+    the candidates.
     """
     score = saliency - cost
     best = int(np.argmax(score))

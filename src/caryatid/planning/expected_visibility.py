@@ -1,20 +1,25 @@
-"""Targets of views, as weighted points: the objects' surfaces, unseen space, relations."""
+"""Targets of views, as weighted points: the objects' surfaces, unseen space, relations.
+
+And goals: which of them matter, and when to stop, if one object is to be removed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from caryatid.config import ActiveVisionConfig
+from caryatid.config import ActiveVisionConfig, SupportConfig
 from caryatid.geometry.polygons import hull
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.sensing.voxel_map import UNKNOWN, Occluders, VoxelMap
+from caryatid.support.relations import Removal, removal_of
 
 SPACE = "unseen space"
 """Subject of a sample of unseen space."""
@@ -85,10 +90,8 @@ def surface_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
 def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | None:
     """Find the box over the table, within the map, that may hold something, up to the highest object's top.
 
-    It begins two voxels over the table, clear of readings of its top.
-
-    Returns:
-        Its corners (3,) and (3,) [m], or None without a table, objects, or space between them.
+    It begins two voxels over the table, clear of readings of its top. Return its corners (3,) and (3,) [m],
+    or None without a table, objects, or space between them.
     """
     table = graph.support_surface
     objects = [o for o in graph.objects if o.role == "object"]
@@ -177,3 +180,58 @@ def unseen_shares(samples: Samples, seen: Array) -> Array:
     count = np.bincount(samples.subjects, minlength=len(samples.names))
     left = np.bincount(samples.subjects, weights=1.0 - seen, minlength=len(samples.names))
     return (left / np.maximum(count, 1))[samples.subjects]
+
+
+def relevant(graph: SupportGraph, goal: str) -> set[str]:
+    """Ids of the goal, of the objects it supports, directly or not, and of their other supporters."""
+    moving = {goal}
+    while above := {s.supported for s in graph.supports if s.supporter in moving} - moving:
+        moving |= above
+    return moving | {s.supporter for s in graph.supports if s.supported in moving}
+
+
+def matter(samples: Samples, graph: SupportGraph, goal: str | None) -> NDArray[np.bool_]:
+    """Whether each of the samples (K,) is about the goal's removal; all are without a known goal.
+
+    That is, about one of the relevant objects, or unseen space over the convex hull of their outlines.
+    """
+    if not _knows(goal, graph):
+        return np.ones(len(samples.weights), dtype=np.bool_)
+    ids = relevant(graph, goal)
+    outlines = [o.shape.footprint() for o in graph.objects if o.role == "object" and o.id in ids]
+    near = shapely.contains_xy(shapely.Polygon(hull(np.concatenate(outlines))), samples.points_world[:, :2])
+    about, space = (np.isin(samples.names, names)[samples.subjects] for names in ([*ids], [SPACE]))
+    return about | (space & near)
+
+
+def predict_goal(
+    graph: SupportGraph, goal: str | None, voxels: VoxelMap, config: SupportConfig
+) -> Removal | None:
+    """Say what moves when the goal is removed; None without a goal, or if no view has shown it."""
+    if not _knows(goal, graph):
+        return None
+    samples = surface_samples(graph, voxels.occluders([o.shape for o in graph.objects]))
+    level = samples.normals_world[:, 2] > np.cos(np.radians(config.max_tilt))
+    top = level & (samples.subjects == samples.names.index(goal))
+    above = samples.points_world[top] + 1.5 * voxels.config.size * samples.normals_world[top]
+    unseen = voxels.state_at(above) == UNKNOWN
+    share = float(unseen.mean()) if len(unseen) else 0.0
+    return replace(removal_of(graph, goal, config), unseen=share)
+
+
+def settled(graph: SupportGraph, goal: str | None, until: float, removal: Removal | None) -> bool:
+    """Whether everything relevant is known with a probability of at least `until`.
+
+    Without a goal, this is the existence of every support. With a goal, it is whether each object moves or
+    stays when the goal is removed, and that nothing unseen rests on the goal: at least that share of its
+    free upper side lies next to seen space. The removal is what `predict_goal` says.
+    """
+    if goal is None:
+        return all(s.belief >= until for s in graph.supports)
+    if removal is None or any(1.0 - until < e.probability < until for e in removal.effects):
+        return False
+    return removal.unseen <= 1.0 - until
+
+
+def _knows(goal: str | None, graph: SupportGraph) -> TypeGuard[str]:
+    return any(o.id == goal for o in graph.objects)

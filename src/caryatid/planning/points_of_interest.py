@@ -39,17 +39,11 @@ class PointOfInterest:
 def points_of_interest(
     graph: SupportGraph, sphere: ViewSphere, visited: Array, config: ActiveVisionConfig
 ) -> list[PointOfInterest]:
-    """Generate the points of interest of a support graph, Algorithm 1.
+    """Generate the points of interest of a support graph after views (V, 3), #views of eq. 2, by Algorithm 1.
 
     An object without a supporter gives the point where the line from the middle of the largest arc between
     earlier views to its centre meets its surface. Every support relation gives one point, at the place set
     by `config.edge_point`.
-
-    Args:
-        graph: The support graph.
-        sphere: The view sphere.
-        visited: Unit directions (V, 3) of the earlier views, #views of eq. 2.
-        config: λ_s, the period of eq. 2 and where a relation's point lies.
     """
     middle = largest_arc(visited)
     centres = {o.id: o.centre_world for o in graph.objects}
@@ -94,15 +88,10 @@ def largest_arc(visited: Array) -> float:
 
 
 def relation_saliency(occurrences: int, views: int, config: ActiveVisionConfig) -> float:
-    """Saliency of a relation that was found in some of the views, eq. 2.
+    """Saliency of a relation that was found in #occ(e) of #views, eq. 2.
 
     s = λ_s + (1 − λ_s) · cos(2π · #occ / #views) as printed (`paper`), or with π in place of 2π
     (`decreasing`), which falls from 1 for a relation never seen to 2λ_s − 1 for one always seen.
-
-    Args:
-        occurrences: #occ(e), the number of views in which it was extracted.
-        views: #views, the number of views so far.
-        config: λ_s, and the period.
     """
     period = 2.0 * np.pi if config.saliency == "paper" else np.pi
     share = min(1.0, occurrences / max(1, views))

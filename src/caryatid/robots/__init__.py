@@ -13,7 +13,7 @@ import numpy as np
 from caryatid.config import Config, RobotConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.geometry.transforms import Array, rigid, rotation_from_vector
-from caryatid.planning.posture import Posture
+from caryatid.planning.candidates import Posture
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
@@ -90,11 +90,10 @@ def find_robot(name: str) -> RobotMaker:
         raise InputError("robot", f"unknown robot '{name}'", f"choose one of {names}")
     point = others.get(name) or EntryPoint(name, name, ENTRY_POINTS)
     try:
-        maker: RobotMaker = point.load()
+        return point.load()
     except (ImportError, AttributeError, ValueError) as error:
         remedy = "give a module:callable that Python can import"
         raise InputError("robot", f"'{point.value}' cannot be imported ({error})", remedy) from None
-    return maker
 
 
 def located(name: str) -> str:

@@ -13,17 +13,10 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.geometry.transforms import Array
-from caryatid.planning.candidates import Candidates
-from caryatid.planning.posture import Posture
+from caryatid.planning.candidates import Candidates, Posture
+from caryatid.robots import protocol
 from caryatid.robots.floor import FloorGrid
-from caryatid.robots.protocol import (
-    OwnViews,
-    SimulatedRobot,
-    Unreachable,
-    count_reasons,
-    posture_at,
-    straight_lengths,
-)
+from caryatid.robots.protocol import OwnViews, SimulatedRobot, Unreachable
 from caryatid.robots.reachability import ReachabilityMap
 from caryatid.sensing.view_sphere import ViewSphere
 
@@ -108,8 +101,14 @@ class ArmRobot(SimulatedRobot, OwnViews):
         """
         centre = proposed.centre_world if self._centre is None else self._centre
         if self._sphere is None or not np.array_equal(self._sphere.centre_world, centre):
-            radius, count = self._radius_around(centre), self._config.sphere_points
-            self._sphere = self._sphere_around(centre, radius, count)
+            radius, largest = self._config.radius
+            if radius != largest:
+                # Thirteen spheres, 5 cm apart with the default radii.
+                radii = np.linspace(radius, largest, 13)
+                spheres = [self._sphere_around(centre, float(r), self._config.radius_views) for r in radii]
+                views = np.array([len(self._offered(sphere)) for sphere in spheres])
+                radius = float(radii[views >= RADIUS_SHARE * views.max()][-1])
+            self._sphere = self._sphere_around(centre, radius, self._config.sphere_points)
         return self._sphere
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
@@ -146,7 +145,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         if self._offer is None or self._offer[0] is not sphere:
             self._offer = sphere, self._offered(sphere)
         views = self._offer[1]
-        return views.from_elsewhere(straight_lengths(self._T_world_camera, views.T_world_camera))
+        return views.from_elsewhere(protocol.straight_lengths(self._T_world_camera, views.T_world_camera))
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
         """Ask `confirm` whether the arm can go to a candidate (4, 4); None = it can."""
@@ -166,24 +165,15 @@ class ArmRobot(SimulatedRobot, OwnViews):
     def _posture_of(self, T_world_camera: Array) -> Posture:
         """The posture at a pose (4, 4), with the joint positions that `confirm` last returned for it."""
         base_yaw = float(np.arctan2(*self.T_world_base[[1, 0], 0]))
-        posture = posture_at(T_world_camera, np.array([*self.T_world_base[:2, 3], base_yaw]))
+        posture = protocol.posture_at(T_world_camera, np.array([*self.T_world_base[:2, 3], base_yaw]))
         T_confirmed, joints = self._confirmed
         return replace(posture, joints=joints) if np.array_equal(T_confirmed, T_world_camera) else posture
-
-    def _radius_around(self, centre_world: Array) -> float:
-        smallest, largest = self._config.radius
-        if smallest == largest:
-            return smallest
-        # Thirteen spheres, 5 cm apart with the default radii.
-        radii = np.linspace(smallest, largest, 13)
-        spheres = [self._sphere_around(centre_world, float(r), self._config.radius_views) for r in radii]
-        views = np.array([len(self._offered(sphere)) for sphere in spheres])
-        return float(radii[views >= RADIUS_SHARE * views.max()][-1])
 
     def _sphere_around(self, centre_world: Array, radius: float, count: int) -> ViewSphere:
         return ViewSphere(centre_world, radius, transforms.rotate(self.T_world_base, fibonacci_sphere(count)))
 
     def _offered(self, sphere: ViewSphere) -> Candidates:
+        """The views of a sphere within reach, each rolled by the smallest sufficient angle."""
         poses = sphere.poses(sphere.directions)
         eyes = poses[:, :3, 3]
         code = np.full(len(poses), -1)
@@ -191,24 +181,18 @@ class ArmRobot(SimulatedRobot, OwnViews):
             code[self._furniture.hidden(eyes, sphere.centre_world)] = 1
         code[eyes[:, 2] < sphere.centre_world[2] + self._config.clearance] = 0
         left = np.flatnonzero(code < 0)
-        held, reached = self._in_some_roll(poses[left])
-        code[left[~reached]] = 2
-        rejected, good = count_reasons(code, REASONS), left[reached]
-        return Candidates(held[reached], sphere.directions[good], np.zeros(len(good)), rejected, good)
-
-    def _in_some_roll(self, T_world_camera: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Roll poses (N, 4, 4) by the smallest sufficient angle; return them, and which are reached (N,)."""
-        held = T_world_camera.copy()
-        reached = np.zeros(len(held), dtype=np.bool_)
+        held, reached = poses[left], np.zeros(len(left), dtype=np.bool_)
         turns = np.arange(self._config.rolls) * (2.0 * np.pi / self._config.rolls)
         turns = np.minimum(turns, 2.0 * np.pi - turns) * np.where(turns > np.pi, -1.0, 1.0)
         for turn in turns[np.argsort(np.abs(turns), kind="stable")]:
-            left = np.flatnonzero(~reached)
+            rest = np.flatnonzero(~reached)
             R = transforms.rotation_from_vector((0.0, 0.0, turn))
-            rolled = T_world_camera[left] @ transforms.rigid(R, np.zeros(3))
+            rolled = poses[left[rest]] @ transforms.rigid(R, np.zeros(3))
             found = self._reaches(rolled)
-            held[left[found]], reached[left[found]] = rolled[found], True
-        return held, reached
+            held[rest[found]], reached[rest[found]] = rolled[found], True
+        code[left[~reached]] = 2
+        rejected, good = protocol.count_reasons(code, REASONS), left[reached]
+        return Candidates(held[reached], sphere.directions[good], np.zeros(len(good)), rejected, good)
 
     def _reaches(self, T_world_camera: Array) -> NDArray[np.bool_]:
         """Ask which poses (N, 4, 4) the hand reaches (N,)."""

@@ -43,13 +43,7 @@ class FloorGrid:
     def from_boxes(
         cls, furniture: Sequence[Box], config: RobotConfig, around_world: ArrayLike = (0.0, 0.0)
     ) -> FloorGrid:
-        """Build the grid around static furniture.
-
-        Args:
-            furniture: Boxes on the floor.
-            config: Footprint, cell, size of the floor and heights that matter.
-            around_world: Middle (2,) of the floor the robot may use, x and y [m].
-        """
+        """Build the grid around static furniture; the middle (2,) of the usable floor is given [m]."""
         origin = np.asarray(around_world, dtype=np.float64)[:2] - config.floor
         count = max(1, round(2.0 * config.floor / config.cell))
         x, y = (low + config.cell * (np.arange(count) + 0.5) for low in origin)
@@ -72,11 +66,7 @@ class FloorGrid:
     ) -> FloorGrid:
         """Build the grid from a map of obstacles (H, W), rows along y, such as a robot's own map.
 
-        Args:
-            occupied: Cells (H, W) with an obstacle.
-            origin_world: Corner (2,) of cell [0, 0], x and y [m].
-            cell: Edge of a cell [m].
-            config: Footprint. Heights are unknown, so no wall hides anything.
+        Its corner (2,) and cell are those of the attributes [m]. No wall hides anything: heights are unknown.
         """
         free = np.ones(occupied.shape, dtype=np.bool_)
         if occupied.any():
@@ -86,11 +76,7 @@ class FloorGrid:
         return cls(free, np.asarray(origin_world, dtype=np.float64), cell)
 
     def cells(self, points_world: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Find the cells under points (N, 2+) [m].
-
-        Returns:
-            Flat cell indices (N,), 0 if outside, and which points are on the floor (N,).
-        """
+        """Find the cells under points (N, 2+) [m]: flat indices (N,), 0 if outside, and which exist (N,)."""
         column, row = np.floor((points_world[:, :2] - self.origin_world) / self.cell).astype(np.intp).T
         height, width = self.free.shape
         inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
@@ -196,5 +182,4 @@ class FloorPaths:
                 heading = int(before[0]) - here
                 corners.append(here)
             corners[-1] = here + heading
-        centres = self.grid.centres(np.array(corners[::-1]))
-        return np.concatenate([self.start_world[None], centres, end_world])
+        return np.concatenate([self.start_world[None], self.grid.centres(np.array(corners[::-1])), end_world])

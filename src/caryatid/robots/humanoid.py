@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from caryatid.config import RobotConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.planning.candidates import Candidates
-from caryatid.planning.posture import Posture
+from caryatid.planning.candidates import Candidates, Posture
 from caryatid.robots.floor import FloorGrid, FloorPaths
 from caryatid.robots.protocol import OwnViews, SimulatedRobot, Unreachable, count_reasons
 from caryatid.sensing.view_sphere import ViewSphere

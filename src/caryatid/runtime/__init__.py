@@ -1,4 +1,4 @@
-"""Compiled kernels, threads, the fingerprint of the code, and late imports."""
+"""Compiled kernels, threads, the fingerprint of the code, late imports, and hooks."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 
@@ -19,6 +20,25 @@ def imported_late(package: str, homes: Mapping[str, Sequence[str]]) -> Callable[
         return getattr(import_module(f"{package}.{module_of[name]}"), name)
 
     return get
+
+
+hooks: dict[str, str] = {}
+"""Hooks by which lower-level packages call higher-level ones without importing them: name of a hook →
+`module:function`, imported at the first call; registered in `caryatid/__init__.py`."""
+
+
+def call(hook: str, *arguments: Any) -> Any:
+    """Call the function registered for one of the `hooks`, and return its result."""
+    return resolve_name(hooks[hook])(*arguments)
+
+
+class Pictured:
+    """Mixin that shows an object as a picture in a notebook."""
+
+    __slots__ = ()
+
+    def _repr_html_(self) -> str:
+        return call("notebook cell", self)
 
 
 LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely")

@@ -15,7 +15,7 @@ from caryatid.geometry import points as kernels
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.display import Pictured
+from caryatid.runtime import Pictured
 from caryatid.sensing.masks import labels_from_masks
 
 SUPPORT_LABEL = 65535

@@ -28,32 +28,29 @@ from annotated_types import Ge
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Base64Bytes
 
+from caryatid import exploration
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, NoSurfaceError, PlanningError
-from caryatid.exploration import (
-    Explorer,
-    Step,
-    given_candidates,
-    next_best_view,
-    reason_to_stop,
-    used_up,
-)
+from caryatid.exploration import Explorer, Step
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array, as_rigid
-from caryatid.graph import Change, SupportGraph
-from caryatid.io.graph_json import graph_text, graph_to_json
+from caryatid.graph import SupportGraph
+from caryatid.io.graph_json import graph_text
 from caryatid.io.images import pack, png, read_mask, unpack
 from caryatid.io.json_files import Numbers, parse_json
-from caryatid.io.log import LATER, Log
-from caryatid.io.staging import read_errors, recover, sync, write_errors, write_file
-from caryatid.planning.decision import PlanningState
+from caryatid.io.staging import LATER, Log, read_errors, recover, sync, write_errors, write_file
+from caryatid.planning.candidates import Candidates
 from caryatid.planning.planners import make_planner
-from caryatid.robots import HUMANOID, Surroundings, find_robot, view_sphere_of
+from caryatid.robots import HUMANOID, Robot, Surroundings, find_robot, view_sphere_of
+from caryatid.robots.floor import STEP, FloorGrid
+from caryatid.robots.protocol import straight_lengths
 from caryatid.runtime import fingerprint
 from caryatid.scene import KEPT, Scene
 from caryatid.segmentation.view_checks import described
+from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import View
-from caryatid.sessions.captures import Capture
-from caryatid.sessions.next_view import REFUSED, NextView, reached_candidates, table_floor
+from caryatid.sessions.messages import Added, Capture, NextView
 
 SESSION_FILE: Final = "session.jsonl"
 """Name of the log."""
@@ -65,6 +62,8 @@ RESTORE: Final = "restore this file, or delete this view and all later lines fro
 """Remedy for a damaged view."""
 ANOTHER_RELEASE: Final = "open it with that release, or add its views to a new session"
 """Remedy for a session of another release."""
+REFUSED = "the robot cannot go there"
+"""Reason to reject a view that a client refuses."""
 
 KNOWN: Final = {
     ("builtins", "set"),
@@ -90,16 +89,7 @@ class SessionConflictError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class Beginning:
-    """Options of a session.
-
-    Attributes:
-        segmentation: `labels`, `auto`, or None to use labels if the first view has them.
-        seed: Seed of every random choice.
-        planner: Name of the planner that chooses the next view.
-        robot: Name of the robot that takes it.
-        settings: All settings.
-        ignore: PNG whose pixels other than 0 are ignored in every view, or None.
-    """
+    """Options of a session, as in `Session.begin`; pixels of `ignore`, a PNG, other than 0 are ignored."""
 
     segmentation: SegmentationMethod | None
     seed: Annotated[int, Ge(0)]
@@ -125,45 +115,6 @@ class Beginning:
             by = f"created by caryatid {line.get('caryatid')}"
             reason = f"{by}, incompatible with this release ({error.reason})"
             raise InputError(path, reason, ANOTHER_RELEASE) from None
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Added:
-    """Result of adding a view.
-
-    Attributes:
-        number: Number of the view, from 0.
-        graph: The fused support graph with it.
-        changed: Whether it changed the graph.
-        T_world_camera: Registered camera pose (4, 4), or None while the view waits.
-        warnings: What may be wrong with the view, or why it waits; one sentence each.
-        changes: Changes of objects since the previous view, seen or reported.
-    """
-
-    number: int
-    graph: SupportGraph
-    changed: bool
-    T_world_camera: Array | None = None
-    warnings: tuple[str, ...] = ()
-    changes: tuple[Change, ...] = ()
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the answer of `caryatid session add` and of the service."""
-        pose = None if self.T_world_camera is None else self.T_world_camera.tolist()
-        document = {"view": self.number, "changed": self.changed, "T_world_camera": pose}
-        known = {"warnings": list(self.warnings), "changes": [asdict(change) for change in self.changes]}
-        return document | known | {"graph": graph_to_json(self.graph)}
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Moved:
-    """moved.json: the motion of an object.
-
-    Attributes:
-        T: Rigid transform (4, 4) in the world frame [m].
-    """
-
-    T: Annotated[Array, Numbers(4, 4, rigid=True)]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -404,7 +355,7 @@ class Session:
         candidates: ArrayLike | None = None,
         path_length: ArrayLike | None = None,
         *,
-        refused: Iterable[ArrayLike] = (),
+        refused: Iterable[ArrayLike] | None = None,
     ) -> NextView:
         """Plan the next best view.
 
@@ -424,26 +375,25 @@ class Session:
         first = self.scene.T_world_cameras[0]
         T_world_cameras = np.stack([first if event.T is None else event.T for event in self._views])
         if candidates is not None:
-            reachable = given_candidates(candidates, path_length, T_world_cameras[-1], sphere)
+            reachable = exploration.given_candidates(candidates, path_length, T_world_cameras[-1], sphere)
         else:
             place = Surroundings(sphere.centre_world, table_floor(self.scene), self.scene.config)
             robot = find_robot(self.beginning.robot)(place)
             sphere = view_sphere_of(robot, sphere)
             reachable = reached_candidates(robot, T_world_cameras[-1], sphere)
-        for number, T in enumerate(refused):
+        for number, T in enumerate([] if refused is None else refused):
             if robot is None:
                 raise InputError("refused", "is given with candidates", "omit them from the candidates")
             reachable = reachable.without(as_rigid(T, f"refused[{number}]"), REFUSED)
         visited = sphere.direction_of(T_world_cameras)
         planner = make_planner(self.beginning.planner)
-        decision = next_best_view(self.scene, robot, visited, candidates=reachable, planner=planner)
-        assert self.scene.voxels is not None
-        state = PlanningState(
-            self.scene.graph, sphere, self.scene.voxels, visited, reachable, self.scene.config.active
+        decision = exploration.next_best_view(
+            self.scene, robot, visited, candidates=reachable, planner=planner
         )
+        state = exploration.planning_state(self.scene, sphere, visited, reachable)
         reports = [number for number, event in enumerate(self._events, start=1) if event.kind == "report"]
-        stop = used_up(len(self._events) - max(reports, default=0), state.config)
-        stop = stop or reason_to_stop(state, self.scene.changed, planner, decision)
+        stop = exploration.used_up(len(self._events) - max(reports, default=0), state.config)
+        stop = stop or exploration.reason_to_stop(state, self.scene.changed, planner, decision)
         return NextView(self.views, decision, stop)
 
     def replay(self) -> Iterator[Step]:
@@ -471,10 +421,7 @@ class Session:
         yield replace(newest, graph=scene.graph, cloud=scene.cloud, stop=stop)
 
     def undo(self) -> int:
-        """Undo the last view, or the last report after it.
-
-        Returns:
-            Number of views left.
+        """Undo the last view, or the last report after it, and return the number of views left.
 
         Raises:
             InputError: The session has no views, or an earlier one is broken; the session does not change.
@@ -525,8 +472,7 @@ class Session:
             content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != event.digest:
             raise InputError(path, "has changed since it was written", RESTORE)
-        view: View = unpack(content, (View,))
-        return replace(view, name=event.name)
+        return replace(unpack(content, (View,)), name=event.name)
 
     def _apply(self, event: Event, scene: Scene) -> None:
         if event.kind == "view":
@@ -538,25 +484,21 @@ class Session:
 
     def _after(self, events: Sequence[Event]) -> Scene:
         """The scene after some events, from the newest usable snapshot and what came after it."""
-        b = self.beginning
-        done, scene = self._read_snapshot(events)
-        scene = scene or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
+        b, done = self.beginning, 0
+        scene = Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
+        for number in range(len(events), 0, -1):
+            # A damaged file may raise anything, and the events are still there.
+            with suppress(Exception):
+                content = gzip.decompress(self._snapshot(events[:number]).read_bytes())
+                found = _Unpickler(io.BytesIO(content)).load()
+                if isinstance(found, Scene):
+                    done, scene = number, found
+                    break
         for number, event in enumerate(events[done:], start=done + 1):
             self._apply(event, scene)
             if self._log.writable:
                 self._write_snapshot(scene, events[:number])
         return scene
-
-    def _read_snapshot(self, events: Sequence[Event]) -> tuple[int, Scene | None]:
-        """The newest snapshot that this code made of the first of these events, and their number."""
-        for number in range(len(events), 0, -1):
-            # A damaged file may raise anything, and the events are still there.
-            with suppress(Exception):
-                content = gzip.decompress(self._snapshot(events[:number]).read_bytes())
-                scene = _Unpickler(io.BytesIO(content)).load()
-                if isinstance(scene, Scene):
-                    return number, scene
-        return 0, None
 
     def _write_snapshot(self, scene: Scene, events: Sequence[Event]) -> None:
         """Keep the scene of all events, and of up to seven less, for undo; a failure costs only time."""
@@ -573,6 +515,31 @@ class Session:
         """File of the scene after these events, named by them and the code that made it."""
         made_of = " ".join((fingerprint(), repr(self.beginning), *map(_told, events)))
         return self.path / "state" / f"{hashlib.sha256(made_of.encode()).hexdigest()}.pickle"
+
+
+def table_floor(scene: Scene) -> FloorGrid:
+    """The floor around the table of a scene; the area under the table top is blocked."""
+    assert scene.surface is not None
+    assert scene.sphere is not None
+    shape = scene.surface.shape
+    top = float(scene.surface.point_world[2])
+    T_world_box = transforms.rigid(shape.T_world_object[:3, :3], (*shape.T_world_object[:2, 3], top / 2.0))
+    extents = np.array([*shape.extents[:2], max(abs(top), 2.0 * STEP)])
+    box = Box(T_world_box, extents)
+    return FloorGrid.from_boxes([box], scene.config.robot, scene.sphere.centre_world[:2])
+
+
+def reached_candidates(robot: Robot, T_world_camera: Array, sphere: ViewSphere) -> Candidates:
+    """Views that a robot can reach from its camera pose (4, 4), with or without its roll.
+
+    If the robot cannot hold that pose, paths are straight lines.
+    """
+    for T in (T_world_camera, transforms.look_at(T_world_camera[:3, 3], sphere.centre_world)):
+        with suppress(PlanningError):
+            robot.move_to(T)
+            return exploration.reachable_views(robot, sphere)
+    found = exploration.reachable_views(robot, sphere)
+    return found.from_elsewhere(straight_lengths(T_world_camera, found.T_world_camera))
 
 
 def _told(event: Event) -> str:

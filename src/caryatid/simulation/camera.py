@@ -25,19 +25,11 @@ def axial_sigma(depth: Array, config: NoiseConfig) -> Array:
 
 
 def add_depth_noise(depth: Array, incidence: Array, config: NoiseConfig, rng: np.random.Generator) -> Array:
-    """Add the sensor's noise to a perfect depth image.
+    """Add the sensor's noise to true depth (H, W) [m], 0 = nothing; one random draw per pixel.
 
-    There is no return outside the range, from surfaces at a grazing angle, and beside depth edges. Gaussian
-    noise is added along the optical axis, and the result is rounded to equal steps of 1/z.
-
-    Args:
-        depth: True depth (H, W) [m], 0 = nothing there.
-        incidence: Angle (H, W) [rad] between each ray and the surface's normal.
-        config: Parameters of the sensor.
-        rng: Source of the noise; always one draw per pixel.
-
-    Returns:
-        Depth (H, W) [m], 0 = no reading.
+    There is no return outside the range, from surfaces at a grazing angle, by the incidence (H, W) [rad]
+    between ray and normal, and beside depth edges. Gaussian noise is added along the optical axis, and the
+    result is rounded to equal steps of 1/z.
     """
     near, far = config.range
     seen = (depth > 0.0) & (incidence <= np.deg2rad(config.grazing)) & ~depth_edges(depth, config.edge_jump)
@@ -63,11 +55,6 @@ def misregister(T_world_camera: Array, config: NoiseConfig, rng: np.random.Gener
 
     The shift is Gaussian with σ = `config.translation` along each axis; the turn is about an axis drawn
     uniformly, by a Gaussian angle with σ = `config.rotation`.
-
-    Args:
-        T_world_camera: True pose (4, 4).
-        config: Sizes of the errors.
-        rng: Source of the error.
     """
     angle = np.deg2rad(config.rotation) * rng.standard_normal()
     axis = transforms.unit(rng.standard_normal(3))
@@ -179,13 +166,9 @@ def intrinsics(sensor: SensorConfig) -> Array:
 
 
 def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: SensorConfig) -> Rendering:
-    """Cast one ray through the middle of each pixel.
+    """Cast a ray through the middle of each pixel of a camera at a pose (4, 4), with pinhole matrix K (3, 3).
 
-    Args:
-        scene: The scene; geoms of group 3 are invisible.
-        T_world_camera: Camera pose (4, 4).
-        K: Pinhole matrix (3, 3) [px].
-        sensor: Image size, range and light.
+    Geoms of group 3 are invisible.
     """
     shape = (sensor.height, sensor.width)
     rays_world, lengths = pixel_rays(K, T_world_camera[:3, :3], sensor.width, sensor.height)
@@ -209,18 +192,10 @@ def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: Senso
 
 
 def pixel_rays(K: Array, R_world_camera: Array, width: int, height: int) -> tuple[Array, Array]:
-    """Rays through the pixels, row by row.
+    """Rays (H·W, 3) in the world frame through the pixels, row by row, and their lengths (H·W,) [m].
 
-    Each ray is one metre long along the optical axis, so distances in rays are depths.
-
-    Args:
-        K: Pinhole matrix (3, 3) [px].
-        R_world_camera: Rotation (3, 3) of the camera.
-        width: Image width [px].
-        height: Image height [px].
-
-    Returns:
-        Rays (H·W, 3) in the world frame and their lengths (H·W,) [m].
+    Each ray is one metre long along the optical axis, so distances in rays are depths. The camera has a
+    pinhole matrix K (3, 3) [px] and a rotation (3, 3).
     """
     u = ((np.arange(width) - K[0, 2]) / K[0, 0])[None, :, None]
     v = ((np.arange(height) - K[1, 2]) / K[1, 1])[:, None, None]

@@ -17,31 +17,14 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sphere
 from caryatid.geometry.solids import Polytope, Solid, hollowed
 from caryatid.geometry.transforms import UP, Array
-from caryatid.simulation.world import (
-    TABLE_HEIGHT,
-    TABLE_SIZE,
-    Body,
-    Side,
-    SimulatedScene,
-    body_poses,
-    bounds,
-    build_spec,
-    scene_from_spec,
-    state_of,
-    strayed,
-    true_shapes,
-)
+from caryatid.simulation import world
+from caryatid.simulation.world import TABLE_HEIGHT, TABLE_SIZE, Body, Side, SimulatedScene
 
 GeneratedKind = Literal["pile", "dense", "packed", "house", "blocks", "boards", "overhang"]
 SIZES: dict[GeneratedKind, tuple[int, int]] = {
-    "pile": (1, 25),
-    "dense": (10, 25),
-    "packed": (2, 25),
-    "house": (1, 14),
-    "blocks": (2, 10),
-    "boards": (4, 12),
-    "overhang": (4, 12),
-}
+    "pile": (1, 25), "dense": (10, 25), "packed": (2, 25), "house": (1, 14), "blocks": (2, 10),
+    "boards": (4, 12), "overhang": (4, 12),
+}  # fmt: skip
 """Kind of a scene → minimum and maximum number of objects, including the screens of a dense one."""
 GAP = 0.002
 """Height above the support from which an object is dropped [m]."""
@@ -107,7 +90,17 @@ def generate(
 def _dense(rng: np.random.Generator, size: int) -> _Plan:
     """Three in ten objects of the heap are dropped in a random orientation, the others upright."""
     radius = 0.12 * max(1.0, np.sqrt(size / 16))
-    screens = _screens(rng)
+    # Two to four thin boxes, taller than most of the heap, with broad sides facing the middle.
+    around = int(rng.integers(2, 5))
+    step = 2.0 * np.pi / around
+    azimuths = rng.uniform(-np.pi, np.pi) + step * (np.arange(around) + rng.uniform(-0.2, 0.2, size=around))
+    screens = []
+    for azimuth in azimuths:
+        distance = rng.uniform(0.2, 0.27)
+        width, height = rng.uniform(0.12, 0.18), rng.uniform(0.23, 0.32)
+        at = (distance * np.cos(azimuth), distance * np.sin(azimuth), TABLE_HEIGHT + height / 2.0)
+        T = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, azimuth)), at)
+        screens.append(Body(Box(T, np.array([0.05, width, height])), density=1200.0))
     sides: tuple[Side, ...] = ("+x", "+y", "-y")
     count = int(rng.integers(1, 3))
     walls = tuple(sides[i] for i in sorted(rng.choice(3, size=count, replace=False)))
@@ -130,15 +123,18 @@ def _packed(rng: np.random.Generator, size: int) -> _Plan:
 
     def draw(scene: SimulatedScene | None) -> _Drop:
         shape = _upright(rng)
-        if rng.random() < 0.5:
-            shape = _turned(shape, turn)
+        if rng.random() < 0.5:  # turn its level axes to those of the pack
+            R = shape.T_world_object[:3, :3]
+            level = int(np.argmin(np.abs(R[2])))
+            back = transforms.rotation_from_vector((0.0, 0.0, -np.arctan2(R[1, level], R[0, level])))
+            shape = shape.moved(transforms.rigid(turn @ back, np.zeros(3)))
         if scene is None:
             return _let_go(shape, np.zeros(2), scene), False
         if rng.random() < 0.3:
             return _on_another(rng, shape, scene), True
         azimuth = rng.uniform(-np.pi, np.pi)
         outward_world = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        return Body(_pushed(shape, outward_world, list(true_shapes(scene).values()))), False
+        return Body(_pushed(shape, outward_world, list(world.true_shapes(scene).values()))), False
 
     return _Plan(draw)
 
@@ -267,8 +263,8 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
     """
 
     def build(solids: Sequence[Body], config: PhysicsConfig = physics, least: float = 0.0) -> SimulatedScene:
-        spec = build_spec(solids, name, plan.table, plan.walls)
-        return scene_from_spec(spec, name, name, config, least=least)
+        spec = world.build_spec(solids, name, plan.table, plan.walls)
+        return world.scene_from_spec(spec, name, name, config, least=least)
 
     # An object that has not come to rest after two seconds is set down again.
     impatient = replace(physics, settle_time=2.0)
@@ -280,10 +276,10 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
             return build(solids)
         solid, stacked = plan.draw(below)
         tried = build([*solids, solid], impatient, least=0.3)
-        on_the_table = bounds(tried, len(solids) + 1)[0][2] <= TABLE_HEIGHT + GAP
+        on_the_table = world.bounds(tried, len(solids) + 1)[0][2] <= TABLE_HEIGHT + GAP
         slipped = stacked and failures < TRIES // 2 and on_the_table
         if not slipped and _stands(tried, solids[:fixed] or solids, plan, physics):
-            shapes = true_shapes(tried).values()
+            shapes = world.true_shapes(tried).values()
             solids = [replace(s, shape=shape) for s, shape in zip([*solids, solid], shapes, strict=True)]
             below, failures = tried, 0
             continue
@@ -301,10 +297,10 @@ def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: P
     first; none may reach higher than 36 cm above the table. Setting down another one may shift the firm ones
     by up to 4 cm.
     """
-    shapes = true_shapes(scene)
+    shapes = world.true_shapes(scene)
     half = np.array(plan.table) / 2.0 - 0.01
     for label, shape in shapes.items():
-        low, high = bounds(scene, label)
+        low, high = world.bounds(scene, label)
         if low[2] < TABLE_HEIGHT - GAP or high[2] > TABLE_HEIGHT + 0.36:
             return False
         if label > len(plan.screens) and (np.abs(shape.T_world_object[:2, 3]) > half).any():
@@ -316,10 +312,10 @@ def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: P
     if not scene.at_rest:
         return False
     # Nothing moves by itself, not even slowly, while the effect of a removal is observed.
-    data = state_of(scene)
+    data = world.state_of(scene)
     mujoco.mj_step(scene.model, data, nstep=round(physics.removal_time / scene.model.opt.timestep))
     limits = physics.moved / 2.0, physics.turned / 2.0
-    return not strayed(body_poses(scene.data), body_poses(data), *limits).any()
+    return not world.strayed(world.body_poses(scene.data), world.body_poses(data), *limits).any()
 
 
 def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Body:
@@ -327,15 +323,15 @@ def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Body:
     over = shape.moved(transforms.rigid(np.eye(3), (*xy, 0.0)))
     tops = [TABLE_HEIGHT]
     if scene is not None:
-        others = true_shapes(scene).items()
-        tops += [float(bounds(scene, label)[1][2]) for label, other in others if _overlap(over, other)]
+        others = world.true_shapes(scene).items()
+        tops += [float(world.bounds(scene, label)[1][2]) for label, other in others if _overlap(over, other)]
     z = max(tops) + float(shape.support(np.array([[0.0, 0.0, -1.0]]))[0]) + GAP
     return Body(over.moved(transforms.rigid(np.eye(3), (0.0, 0.0, z))))
 
 
 def _on_another(rng: np.random.Generator, shape: Shape, scene: SimulatedScene) -> Body:
     """Put a shape from the origin over a random object, up to 0.3 of its half extents off its middle."""
-    below = list(true_shapes(scene).values())[int(rng.integers(len(scene.object_bodies)))]
+    below = list(world.true_shapes(scene).values())[int(rng.integers(len(scene.object_bodies)))]
     reach = 0.3 * below.support(np.eye(3))[:2]
     xy = below.T_world_object[:2, 3] + reach * rng.uniform(-1.0, 1.0, size=2)
     return _let_go(shape, xy, scene)
@@ -371,49 +367,19 @@ def _shape(rng: np.random.Generator, R: Array) -> Shape:
     return Sphere(T, radius)
 
 
-def _screens(rng: np.random.Generator) -> list[Body]:
-    """Two to four thin boxes around a heap, taller than most of it, with broad sides facing the middle."""
-    count = int(rng.integers(2, 5))
-    step = 2.0 * np.pi / count
-    azimuths = rng.uniform(-np.pi, np.pi) + step * (np.arange(count) + rng.uniform(-0.2, 0.2, size=count))
-    screens = []
-    for azimuth in azimuths:
-        distance = rng.uniform(0.2, 0.27)
-        width, height = rng.uniform(0.12, 0.18), rng.uniform(0.23, 0.32)
-        at = (distance * np.cos(azimuth), distance * np.sin(azimuth), TABLE_HEIGHT + height / 2.0)
-        T = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, azimuth)), at)
-        screens.append(Body(Box(T, np.array([0.05, width, height])), density=1200.0))
-    return screens
-
-
-def _turned(shape: Shape, turn: Array) -> Shape:
-    """Turn a shape at the origin so that its level axes are those of the pack."""
-    R = shape.T_world_object[:3, :3]
-    level = int(np.argmin(np.abs(R[2])))
-    yaw = np.arctan2(R[1, level], R[0, level])
-    back = transforms.rotation_from_vector((0.0, 0.0, -yaw))
-    return shape.moved(transforms.rigid(turn @ back, np.zeros(3)))
-
-
 def _pushed(shape: Shape, outward_world: Array, others: Sequence[Shape]) -> Shape:
     """Push a shape over the table from outside towards the middle, until it is `CLOSE` to another one."""
     z = TABLE_HEIGHT + float(shape.support(np.array([[0.0, 0.0, -1.0]]))[0]) + CLOSE
     distance = float(np.hypot(*TABLE_SIZE))
     for _ in range(60):
         at = shape.moved(transforms.rigid(np.eye(3), distance * outward_world + (0.0, 0.0, z)))
-        gap = min(_gap(at, other) for other in others)
+        # From samples on both surfaces, 4 mm apart.
+        pairs = [pair for other in others for pair in ((at, other), (other, at))]
+        gap = min(float(a.signed_distance(b.surface(0.004)[0]).min()) for a, b in pairs)
         if gap < CLOSE or distance <= 0.0:
             break
         distance = max(distance - gap + CLOSE / 2.0, 0.0)
     return at
-
-
-def _gap(a: Shape, b: Shape) -> float:
-    """Distance [m] between two shapes, from samples on both surfaces 4 mm apart."""
-    return min(
-        float(a.signed_distance(b.surface(0.004)[0]).min()),
-        float(b.signed_distance(a.surface(0.004)[0]).min()),
-    )
 
 
 # Household objects, upright at the origin
@@ -429,21 +395,34 @@ Ring = tuple[float, float]
 
 def thing(rng: np.random.Generator) -> Shape:
     """Draw a tray, a bowl, a mug or the like; four in ten are hollow."""
-    makers: dict[Callable[[np.random.Generator], Shape], float] = {
-        tray: 0.1, bowl: 0.12, mug: 0.12, _open_box: 0.06, _plate: 0.14,
-        _book: 0.14, _carton: 0.08, _can: 0.08, bottle: 0.06, _fruit: 0.1,
+    kinds = {
+        "tray": 0.1, "bowl": 0.12, "mug": 0.12, "open box": 0.06, "plate": 0.14,
+        "book": 0.14, "carton": 0.08, "can": 0.08, "bottle": 0.06, "fruit": 0.1,
     }  # fmt: skip
-    shape = list(makers)[int(rng.choice(len(makers), p=list(makers.values())))](rng)
+    made = {"tray": tray, "bowl": bowl, "mug": mug, "bottle": bottle}
+    shape: Shape
+    match list(kinds)[int(rng.choice(len(kinds), p=list(kinds.values())))]:
+        case "open box":
+            shape = _hollow_box(*rng.uniform((0.11, 0.13, 0.07), (0.15, 0.2, 0.11)))
+        case "plate":
+            shape = Cylinder(np.eye(4), float(rng.uniform(0.085, 0.12)), 0.018)
+        case "book":
+            shape = Box(np.eye(4), rng.uniform((0.13, 0.18, 0.018), (0.17, 0.24, 0.045)))
+        case "carton":
+            shape = Box(np.eye(4), rng.uniform((0.06, 0.11, 0.16), (0.08, 0.14, 0.2)))
+        case "can":
+            shape = Cylinder(np.eye(4), float(rng.uniform(0.03, 0.04)), float(rng.uniform(0.09, 0.125)))
+        case "fruit":
+            half = rng.uniform(0.028, 0.042) * np.array([1.0, 0.95, 0.88])
+            shape = Solid.of([_hull(fibonacci_sphere(120) * half)])
+        case kind:
+            shape = made[kind](rng)
     return shape.moved(transforms.rigid(_yaw(rng), np.zeros(3)))
 
 
 def tray(rng: np.random.Generator) -> Solid:
     """Draw a tray with a low rim."""
     return _hollow_box(*rng.uniform((0.2, 0.26, 0.03), (0.27, 0.36, 0.06)))
-
-
-def _open_box(rng: np.random.Generator) -> Shape:
-    return _hollow_box(*rng.uniform((0.11, 0.13, 0.07), (0.15, 0.2, 0.11)))
 
 
 def _hollow_box(x: float, y: float, z: float) -> Solid:
@@ -465,12 +444,14 @@ def bowl(rng: np.random.Generator) -> Solid:
 def mug(rng: np.random.Generator) -> Solid:
     """Draw a straight wall, a floor, and a handle of three bars."""
     radius, height = float(rng.uniform(0.036, 0.046)), float(rng.uniform(0.075, 0.1))
-    bars = [
-        _bar((radius + 0.01, 0.0, 0.25 * height), (0.024, 0.01, 0.01)),
-        _bar((radius + 0.01, 0.0, 0.75 * height), (0.024, 0.01, 0.01)),
-        _bar((radius + 0.025, 0.0, 0.5 * height), (0.01, 0.01, 0.5 * height + 0.01)),
-    ]
-    return Solid.of([*_wall((radius, 0.0), (radius, height)), _disc(radius), *bars])
+    corners = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / 2.0
+    bars = (
+        ((radius + 0.01, 0.0, 0.25 * height), (0.024, 0.01, 0.01)),
+        ((radius + 0.01, 0.0, 0.75 * height), (0.024, 0.01, 0.01)),
+        ((radius + 0.025, 0.0, 0.5 * height), (0.01, 0.01, 0.5 * height + 0.01)),
+    )
+    handle = [_hull(centre + corners * extents) for centre, extents in bars]
+    return Solid.of([*_wall((radius, 0.0), (radius, height)), _disc(radius), *handle])
 
 
 def bottle(rng: np.random.Generator) -> Solid:
@@ -478,27 +459,6 @@ def bottle(rng: np.random.Generator) -> Solid:
     radius, height = float(rng.uniform(0.03, 0.04)), float(rng.uniform(0.17, 0.24))
     rings = [(radius, 0.0), (radius, 0.6 * height), (0.013, 0.78 * height), (0.013, height)]
     return Solid.of([_hull([*_ring(a), *_ring(b)]) for a, b in pairwise(rings)])
-
-
-def _fruit(rng: np.random.Generator) -> Shape:
-    half = rng.uniform(0.028, 0.042) * np.array([1.0, 0.95, 0.88])
-    return Solid.of([_hull(fibonacci_sphere(120) * half)])
-
-
-def _plate(rng: np.random.Generator) -> Shape:
-    return Cylinder(np.eye(4), float(rng.uniform(0.085, 0.12)), 0.018)
-
-
-def _can(rng: np.random.Generator) -> Shape:
-    return Cylinder(np.eye(4), float(rng.uniform(0.03, 0.04)), float(rng.uniform(0.09, 0.125)))
-
-
-def _book(rng: np.random.Generator) -> Shape:
-    return Box(np.eye(4), rng.uniform((0.13, 0.18, 0.018), (0.17, 0.24, 0.045)))
-
-
-def _carton(rng: np.random.Generator) -> Shape:
-    return Box(np.eye(4), rng.uniform((0.06, 0.11, 0.16), (0.08, 0.14, 0.2)))
 
 
 def _wall(low: Ring, high: Ring) -> list[Polytope]:
@@ -511,11 +471,6 @@ def _wall(low: Ring, high: Ring) -> list[Polytope]:
 def _disc(radius: float) -> Polytope:
     """The floor of a round object."""
     return _hull([*_ring((radius - WALL / 2.0, 0.0)), *_ring((radius - WALL / 2.0, WALL))])
-
-
-def _bar(centre: Sequence[float], size: Sequence[float]) -> Polytope:
-    corners = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / 2.0
-    return _hull(centre + corners * size)
 
 
 def _ring(ring: Ring) -> Array:

@@ -57,7 +57,20 @@ class Lifting:
     """
 
     def __init__(self, spec: Any, bodies: Sequence[str]) -> None:
-        self.model = model = _with_hands(spec, bodies)
+        spec = spec.copy()
+        spec.option.noslip_iterations = max(spec.option.noslip_iterations, 5)
+        for name in bodies:  # a hand each, which does not grasp yet
+            spec.worldbody.add_body(name=HAND + name, mocap=True)
+            weld = spec.add_equality(
+                name=HAND + name, name1=HAND + name, name2=name, active=False, type=mujoco.mjtEq.mjEQ_WELD,
+                objtype=mujoco.mjtObj.mjOBJ_BODY,
+                # A grasp yields by well under a millimetre, at time steps up to 5 ms.
+                solref=[0.01, 1.0], solimp=[0.95, 0.99, 0.001, 0.5, 2.0],
+            )  # fmt: skip
+            # Both in one place: anchor, relative position and quaternion, and the weight of rotation [m].
+            weld.data = [*[0.0] * 6, 1.0, *[0.0] * 3, 1.0, 0.0]
+        with mujoco_warnings_ignored():
+            self.model = model = spec.compile()
         body = [model.body(name).id for name in bodies]
         joints = model.body_jntadr[body]
         self._qpos = model.jnt_qposadr[joints][:, None] + np.arange(7)
@@ -176,21 +189,3 @@ class Lifting:
 def _still(before: Array, after: Array) -> bool:
     """Whether objects rest in two states a quarter of a second apart, within 0.2 mm and 0.2°."""
     return not strayed(before, after, 2e-4, 0.2).any()
-
-
-def _with_hands(spec: Any, bodies: Sequence[str]) -> Any:
-    """Compile a spec with one hand per object, without grasps yet."""
-    spec = spec.copy()
-    spec.option.noslip_iterations = max(spec.option.noslip_iterations, 5)
-    for name in bodies:
-        spec.worldbody.add_body(name=HAND + name, mocap=True)
-        weld = spec.add_equality(
-            name=HAND + name, name1=HAND + name, name2=name, active=False, type=mujoco.mjtEq.mjEQ_WELD,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
-            # A grasp yields by well under a millimetre, at time steps up to 5 ms.
-            solref=[0.01, 1.0], solimp=[0.95, 0.99, 0.001, 0.5, 2.0],
-        )  # fmt: skip
-        # Both in the same place: anchor, relative position and quaternion, and the weight of rotation [m].
-        weld.data = [*[0.0] * 6, 1.0, *[0.0] * 3, 1.0, 0.0]
-    with mujoco_warnings_ignored():
-        return spec.compile()

@@ -17,19 +17,9 @@ import mujoco
 
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
+from caryatid.simulation import world
 from caryatid.simulation.generation import SIZES, GeneratedKind, generate
-from caryatid.simulation.world import (
-    Body,
-    SimulatedScene,
-    bounds,
-    box,
-    build_spec,
-    cylinder,
-    mujoco_warnings_ignored,
-    scene_from_spec,
-    sphere,
-    table_centre,
-)
+from caryatid.simulation.world import Body, SimulatedScene, box, cylinder, sphere
 
 log = logging.getLogger(__name__)
 
@@ -138,7 +128,7 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
     """
     text = fspath(source)
     if text in DESIGNED:  # give the solids a second to find their contacts
-        return scene_from_spec(build_spec(DESIGNED[text], text), text, text, config, least=1.0)
+        return world.scene_from_spec(world.build_spec(DESIGNED[text], text), text, text, config, least=1.0)
     if match := _GENERATED.fullmatch(text):
         return generate(cast(GeneratedKind, match[1]), int(match[2]), int(match[3]), config)
     path, listed = Path(text), "`caryatid scenes` lists the built-in ones"
@@ -152,20 +142,19 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
             remedy = f"give the folder of a scene, or of a recording (scene_camera.json, depth.txt); {listed}"
             raise InputError(text, f"a folder without {SCENE_FILE}", remedy)
     if path.suffix.lower() != ".xml" or not path.is_file():
-        raise InputError(
-            path, "not an MJCF file", f"give an .xml file or a folder with a {SCENE_FILE}; {listed}"
-        )
+        remedy = f"give an .xml file or a folder with a {SCENE_FILE}; {listed}"
+        raise InputError(path, "not an MJCF file", remedy)
     _check_sizes(path, config or PhysicsConfig())
     try:
-        with mujoco_warnings_ignored():
+        with world.mujoco_warnings_ignored():
             spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise InputError(path, f"not an MJCF file ({reason})", "correct the XML") from None
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
-    scene = scene_from_spec(spec, name or path.stem, str(path), config)
-    top = table_centre(scene)[2]
-    if fallen := [body for label, body in scene.object_bodies.items() if bounds(scene, label)[1][2] < top]:
+    scene = world.scene_from_spec(spec, name or path.stem, str(path), config)
+    top, bodies = world.table_centre(scene)[2], scene.object_bodies
+    if fallen := [bodies[label] for label in bodies if world.bounds(scene, label)[1][2] < top]:
         log.warning("%s: %s fell off the table before the first view", path, ", ".join(fallen))
     if not scene.at_rest:
         log.warning("%s: the scene still moves; its ground truth may change between views", path)

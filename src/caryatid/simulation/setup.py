@@ -9,7 +9,7 @@ import numpy as np
 
 from caryatid.config import Config, NoiseModel, RobotConfig
 from caryatid.geometry.transforms import Array
-from caryatid.planning.posture import Posture
+from caryatid.planning.candidates import Posture
 from caryatid.robots import HUMANOID, Robot, RobotMaker, Surroundings, find_robot, go_home
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
@@ -24,12 +24,8 @@ PLATFORM, MAST, NECK = 0.3, 0.04, 0.15
 class HumanoidBody:
     """A platform and a mast that the torso lift extends, in a copy of a scene.
 
-    It collides with nothing. The head is left out, because it is behind the camera.
-
-    Args:
-        scene: The scene; it does not change.
-        robot: Finds the posture for a camera pose.
-        config: Its footprint and heights.
+    It collides with nothing. The head is left out, because it is behind the camera. The robot finds its
+    posture for a camera pose.
 
     Attributes:
         scene: The copy, with the body where it was last placed.
@@ -86,21 +82,11 @@ class Simulation:
 
 
 def make_simulation(
-    scene: SimulatedScene,
-    config: Config,
-    *,
-    noise: NoiseModel,
-    seed: int,
-    robot: RobotMaker | str = HUMANOID,
+    scene: SimulatedScene, config: Config, *, noise: NoiseModel, seed: int, robot: RobotMaker | str = HUMANOID
 ) -> Simulation:
     """Put a robot at its home view in front of the table, with the furniture on its floor map.
 
-    Args:
-        scene: The scene in physics.
-        config: Robot, sensor, noise and view sphere.
-        noise: Noise of the camera.
-        seed: Seed of the noise.
-        robot: Makes the robot, or its name for `find_robot`.
+    The robot is a maker, or a name for `find_robot`; the seed is that of the camera's noise.
 
     Raises:
         InputError: There is no robot of this name.

@@ -54,16 +54,12 @@ class GroundTruth:
 
 
 def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> GroundTruth:
-    """Derive the support graph from physics.
+    """Derive the support graph from the physics of a settled scene, whose state does not change.
 
     A supports B `bottom-up` if the upward part of the mean contact force of A on B exceeds 3 % of B's weight.
     Each object A is then removed for a second. A also supports an object B in contact with it that moves by
     more than 1 cm or 8° without it: `top-down` if A presses on B, `lean` if the force between them is mostly
     horizontal.
-
-    Args:
-        scene: A settled scene; its state does not change.
-        config: The thresholds.
     """
     config = config or PhysicsConfig()
     names = {0: scene.table, **scene.object_bodies}
@@ -88,13 +84,10 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
 
 
 def mean_contact_forces(scene: SimulatedScene) -> dict[tuple[int, int], Array]:
-    """Mean force of A on B over a fifth of a second, for every pair of bodies that touch.
+    """Mean force (3,) [N] of A on B over a fifth of a second, by the labels of each pair that touches.
 
-    Soft contacts creep, so longer means would drift.
-
-    Returns:
-        (label of A, label of B) to the force (3,) [N] in the world frame, for both directions of a pair.
-        Label 0 is the table; contacts with anything else are left out.
+    Soft contacts creep, so longer means would drift. Label 0 is the table; contacts with anything else are
+    left out. Both directions of a pair are there.
     """
     labels = np.where(scene.geom_labels > 0, scene.geom_labels, np.int32(-1))
     labels[scene.geoms(0)] = 0

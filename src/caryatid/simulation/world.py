@@ -112,11 +112,9 @@ def scene_from_spec(
     geom_labels = np.where(np.isin(geom_roots, free), np.searchsorted(free, geom_roots) + 1, 0)
     if unseen := set(names) - set(geom_labels.tolist()):
         raise InputError(source, f"body '{names[min(unseen)]}' has no geom", "give every object a shape")
-    data = mujoco.MjData(model)
+    data, labels = mujoco.MjData(model), geom_labels.astype(np.int32)
     at_rest = _settle(model, data, source, config or PhysicsConfig(), least=least)
-    return SimulatedScene(
-        model, data, spec, name, source, names, TABLE, geom_labels.astype(np.int32), at_rest
-    )
+    return SimulatedScene(model, data, spec, name, source, names, TABLE, labels, at_rest)
 
 
 def _settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: float) -> bool:
@@ -235,14 +233,7 @@ class Body:
 
 
 def box(size: Vector, at: Vector, turn: Vector = (0.0, 0.0, 0.0), **matter: float) -> Body:
-    """A cuboid.
-
-    Args:
-        size: Full edge lengths [m].
-        at: Centre in x and y, and the height of the centre over the table top in z [m].
-        turn: Rotation vector [deg].
-        **matter: Density and friction of a `Body`.
-    """
+    """A cuboid of a size [m], with its centre in x, y and, over the table top, z [m]; turned [deg]."""
     return Body(Box(_placed(at, turn), np.array(size)), **matter)
 
 
@@ -272,17 +263,7 @@ def build_spec(
     table_size: tuple[float, float] = TABLE_SIZE,
     walls: Sequence[Side] = (),
 ) -> Any:
-    """Build a floor, a table with legs, walls beside it and free bodies `object0`, `object1`, … on it.
-
-    Args:
-        bodies: The free bodies, in order.
-        name: Name of the model.
-        table_size: Depth along x and width along y of the top [m].
-        walls: Sides of the table where a wall stands.
-
-    Returns:
-        The `mujoco.MjSpec`.
-    """
+    """Build the `MjSpec` of a floor, a table, walls beside it, and bodies `object0`, `object1`, … on it."""
     spec = empty_spec(name)
     spec.worldbody.add_geom(name="floor", type=_GEOM.mjGEOM_PLANE, size=[10.0, 10.0, 0.1])
     table = spec.worldbody.add_body(name=TABLE)
@@ -314,8 +295,7 @@ def build_spec(
 def palette(index: int) -> tuple[float, float, float, float]:
     """Colour of the object with this number; neighbours in number differ widely in hue."""
     hue = (0.02 + index * 0.618034) % 1.0  # multiples of the golden ratio stay apart
-    value = (0.88, 0.7, 0.55)[(index // 7) % 3]
-    return (*colorsys.hsv_to_rgb(hue, 0.75, value), 1.0)
+    return (*colorsys.hsv_to_rgb(hue, 0.75, (0.88, 0.7, 0.55)[(index // 7) % 3]), 1.0)
 
 
 def quaternion(R: Array) -> Array:
@@ -333,14 +313,7 @@ def _placed(at: Vector, turn: Vector = (0.0, 0.0, 0.0)) -> Array:
 def add_body(
     spec: Any, name: str, body: Body, rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
 ) -> None:
-    """Add a free body to a MuJoCo spec: a geom for each convex part, those of a solid as meshes.
-
-    Args:
-        spec: `mujoco.MjSpec`, changed in place.
-        name: Name of the body.
-        body: Its shape, pose and matter.
-        rgba: Its colour.
-    """
+    """Add a free body to a `mujoco.MjSpec`: a geom for each convex part, those of a solid as meshes."""
     shape = body.shape
     T_world_body = shape.T_world_object
     added = spec.worldbody.add_body(name=name, pos=T_world_body[:3, 3], quat=quaternion(T_world_body[:3, :3]))
@@ -392,26 +365,33 @@ def _outline(scene: SimulatedScene, geom: int) -> Array:
 
 def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
     """Lowest and highest corner, (3,) each [m], of the world-aligned box around an object (0: the table)."""
-    lows, highs = zip(*(_span(scene, geom) for geom in _solid_geoms(scene, label)), strict=True)
+    lows, highs = [], []
+    for geom in _solid_geoms(scene, label):
+        shape = _primitive(scene, geom)
+        points = _outline(scene, geom) if shape is None else shape.T_world_object[None, :3, 3]
+        reach = np.zeros(3) if shape is None else shape.support(np.eye(3))
+        if isinstance(shape, Cylinder):  # as `support` to the last digit but one, and seeds keep their scenes
+            axis = np.abs(shape.T_world_object[:3, 2])
+            reach = shape.height / 2.0 * axis + shape.radius * np.sqrt(np.clip(1.0 - axis**2, 0.0, None))
+        lows.append(points.min(axis=0) - reach)
+        highs.append(points.max(axis=0) + reach)
     return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
 def true_shapes(scene: SimulatedScene) -> dict[int, Shape]:
     """Shape of every object by label: a box, a cylinder, a sphere, or a solid of its geoms."""
-    return {label: _true_shape(scene, label) for label in scene.object_bodies}
-
-
-def _true_shape(scene: SimulatedScene, label: int) -> Shape:
-    geoms = _solid_geoms(scene, label)
-    shape = _primitive(scene, geoms[0]) if len(geoms) == 1 else None
-    if shape is not None:
-        return shape
-    T_world_body = transforms.rigid(
-        scene.data.xmat[scene.body_id(label)].reshape(3, 3), scene.data.xpos[scene.body_id(label)]
-    )
-    T_body_world = transforms.invert(T_world_body)
-    parts = [Polytope.around(transforms.transform(T_body_world, _outline(scene, geom))) for geom in geoms]
-    return Solid(T_world_body, tuple(part for part in parts if part is not None))
+    shapes: dict[int, Shape] = {}
+    for label in scene.object_bodies:
+        geoms, body = _solid_geoms(scene, label), scene.body_id(label)
+        shape = _primitive(scene, geoms[0]) if len(geoms) == 1 else None
+        if shape is None:
+            T_world_body = transforms.rigid(scene.data.xmat[body].reshape(3, 3), scene.data.xpos[body])
+            T_body_world = transforms.invert(T_world_body)
+            outlines = [transforms.transform(T_body_world, _outline(scene, geom)) for geom in geoms]
+            parts = tuple(part for part in map(Polytope.around, outlines) if part is not None)
+            shape = Solid(T_world_body, parts)
+        shapes[label] = shape
+    return shapes
 
 
 def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
@@ -457,18 +437,4 @@ def _primitive(scene: SimulatedScene, geom: int) -> Shape | None:
 def _geom_box(scene: SimulatedScene, geom: int) -> Box:
     """Return the box around a geom along the geom's own axes."""
     centre, half = scene.model.geom_aabb[geom, :3], scene.model.geom_aabb[geom, 3:]
-    T_world_geom = _geom_pose(scene, geom)
-    return Box(T_world_geom @ transforms.rigid(np.eye(3), centre), 2.0 * half)
-
-
-def _span(scene: SimulatedScene, geom: int) -> tuple[Array, Array]:
-    """Lowest and highest corner, (3,) each [m], of the world-aligned box around a geom."""
-    shape = _primitive(scene, geom)
-    if shape is None:
-        corners = _outline(scene, geom)
-        return corners.min(axis=0), corners.max(axis=0)
-    centre, reach = shape.T_world_object[:3, 3], shape.support(np.eye(3))
-    if isinstance(shape, Cylinder):  # as `support` to the last digit but one, and seeds keep their scenes
-        axis = np.abs(shape.T_world_object[:3, 2])
-        reach = shape.height / 2.0 * axis + shape.radius * np.sqrt(np.clip(1.0 - axis**2, 0.0, None))
-    return centre - reach, centre + reach
+    return Box(_geom_pose(scene, geom) @ transforms.rigid(np.eye(3), centre), 2.0 * half)

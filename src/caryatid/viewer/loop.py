@@ -21,8 +21,7 @@ from caryatid.exploration import Explorer, Step, used_up
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import TakeStep
-from caryatid.manipulation.clearing import clear
-from caryatid.manipulation.dismantling import SimulatedHands, Taken
+from caryatid.manipulation.clearing import SimulatedHands, Taken, clear
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.decision import Decision
 from caryatid.planning.planners import BUILT_IN, ORACLE, offered

@@ -22,7 +22,7 @@ from caryatid.config import Config, ReportConfig
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.graph import DOUBTFUL, SupportGraph
-from caryatid.manipulation.dismantling import Taken
+from caryatid.manipulation.clearing import Taken
 from caryatid.sensing.views import Cloud
 from caryatid.simulation.camera import intrinsics, render
 from caryatid.simulation.lifting import ASIDE

@@ -12,18 +12,14 @@ if TYPE_CHECKING:
     from caryatid.planning.decision import Planner
 
 VOLUMETRIC = (
-    "occlusion-aware",
-    "unobserved-voxel",
-    "rear-side-voxel",
-    "rear-side-entropy",
-    "proximity-count",
-)
+    "occlusion-aware", "unobserved-voxel", "rear-side-voxel", "rear-side-entropy", "proximity-count",
+)  # fmt: skip
 """The planners that are a `VolumetricPlanner` of the formulation of that name."""
 
 BUILT_IN: dict[str, tuple[str, ...]] = {
     "support": ("hidden_surface", "SupportPlanner"),
     "attention": ("saliency", "AttentionPlanner"),
-    "paper": ("paper", "PaperPlanner"),
+    "paper": ("saliency", "PaperPlanner"),
     "random": ("baselines", "RandomPlanner"),
     "ring": ("baselines", "RingPlanner"),
     "farthest": ("baselines", "FarthestPlanner"),
@@ -50,23 +46,18 @@ def make_planner(name: Planner | str) -> Planner:
     Raises:
         InputError: There is none, and the message lists the known ones; or it is `oracle`.
     """
-    planner: Planner
     if not isinstance(name, str):
         check_type("planner", name, "plan", "give the name of a planner, or an object with a method plan()")
         return name
     if name in BUILT_IN:
         module, maker, *arguments = BUILT_IN[name]
-        planner = getattr(import_module(f"{__name__}.{module}"), maker)(*arguments)
-        return planner
+        return getattr(import_module(f"{__name__}.{module}"), maker)(*arguments)
     others = offered()
     if name in others:
-        planner = others[name].load()()
-        return planner
+        return others[name].load()()
     if name == ORACLE:
-        raise InputError(
-            "planner",
-            f"'{ORACLE}' requires the ground truth of a simulated scene",
-            "give a scene, or create caryatid.evaluation.oracle.OraclePlanner",
-        )
+        reason = f"'{ORACLE}' requires the ground truth of a simulated scene"
+        remedy = "give a scene, or create caryatid.evaluation.oracle.OraclePlanner"
+        raise InputError("planner", reason, remedy)
     names = ", ".join([*BUILT_IN, *sorted(others), ORACLE])
     raise InputError("planner", f"unknown planner '{name}'", f"choose one of {names}")

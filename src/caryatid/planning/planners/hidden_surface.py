@@ -18,26 +18,11 @@ import numpy as np
 from caryatid.config import ActiveVisionConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
+from caryatid.planning import expected_visibility as targets
+from caryatid.planning import points_of_interest as interest
 from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
-from caryatid.planning.expected_visibility import (
-    SPACE,
-    Samples,
-    join,
-    newly_visible,
-    relation_samples,
-    space_samples,
-    surface_samples,
-    unseen_shares,
-    visibility,
-)
-from caryatid.planning.goals import matter
-from caryatid.planning.points_of_interest import (
-    PointOfInterest,
-    inhibition_of_return,
-    painted,
-    points_of_doubt,
-    points_of_interest,
-)
+from caryatid.planning.expected_visibility import SPACE, Samples
+from caryatid.planning.points_of_interest import PointOfInterest, inhibition_of_return, painted
 
 WORTH_SAYING = 0.05
 """Shares of the whole below this are not mentioned."""
@@ -56,8 +41,8 @@ class SupportPlanner:
         check_candidates(state)
         config, sphere, candidates = state.config, state.sphere, state.candidates
         looks = candidates.looks(config.look_directions)
-        relations = points_of_interest(state.graph, sphere, state.visited, config)
-        relations += points_of_doubt(state.graph, sphere, state.visited)
+        relations = interest.points_of_interest(state.graph, sphere, state.visited, config)
+        relations += interest.points_of_doubt(state.graph, sphere, state.visited)
         samples, gain = _expected_gain(state, relations, candidates.T_world_camera[looks.chosen])
         inhibition = inhibition_of_return(state.visited, candidates.directions[looks.chosen], config)
         points = (*relations, *_hidden_points(state, samples, gain))
@@ -78,20 +63,21 @@ def _expected_gain(
     """Samples of what is still hidden, and what cameras (C, 4, 4) show of them for the first time (K, C)."""
     config = state.config
     occluders = state.voxels.occluders([o.shape for o in state.graph.objects])
-    surfaces, points = surface_samples(state.graph, occluders), relation_samples(relations)
+    surfaces, points = targets.surface_samples(state.graph, occluders), targets.relation_samples(relations)
     T_world_visited = state.sphere.poses(state.visited)
-    seen = visibility(join([surfaces, points]), T_world_visited, occluders, config).max(axis=1, initial=0.0)
-    shares = unseen_shares(surfaces, seen[: len(surfaces.weights)])
+    known = targets.join([surfaces, points])
+    seen = targets.visibility(known, T_world_visited, occluders, config).max(axis=1, initial=0.0)
+    shares = targets.unseen_shares(surfaces, seen[: len(surfaces.weights)])
     surfaces = replace(surfaces, weights=surfaces.weights * shares)
     # All relations' points of interest weigh a tenth of all the objects' surfaces.
     points = replace(points, weights=0.1 * points.weights)
-    space = space_samples(state.graph, occluders)
-    samples = join([surfaces, points, space])
-    samples = replace(samples, weights=samples.weights * matter(samples, state.graph, state.goal))
+    space = targets.space_samples(state.graph, occluders)
+    samples = targets.join([surfaces, points, space])
+    samples = replace(samples, weights=samples.weights * targets.matter(samples, state.graph, state.goal))
     before = np.concatenate([seen, np.zeros(len(space.weights))])
     new = samples.weights * (1.0 - before) > 0.0
     samples = samples.select(new)
-    return samples, newly_visible(samples, before[new], T_world_camera, occluders, config)
+    return samples, targets.newly_visible(samples, before[new], T_world_camera, occluders, config)
 
 
 def _on_sphere(

@@ -62,7 +62,12 @@ class VolumetricPlanner:
         """
         check_candidates(state)
         candidates, config = state.candidates, state.config
-        looks = _new_views(state, candidates.looks(config.look_directions))
+        looks = candidates.looks(config.look_directions)
+        # Nearer to an earlier view than to one another.
+        cosine = candidates.directions[looks.chosen] @ state.visited.T
+        old = cosine.max(axis=1) >= np.cos(np.sqrt(4.0 * np.pi / config.look_directions))
+        if not old.all():
+            looks = Looks.of(looks.chosen[~old], candidates.directions)
         corners = space_above(state.graph, state.voxels)
         gain = np.zeros(len(looks.chosen))
         if corners is not None:
@@ -88,14 +93,6 @@ class VolumetricPlanner:
         return f"{mean}, {share:.0%} of the maximum"
 
 
-def _new_views(state: PlanningState, looks: Looks) -> Looks:
-    """Leave out candidates nearer to an earlier view than to one another, unless that is all."""
-    directions = state.candidates.directions
-    cosine = directions[looks.chosen] @ state.visited.T
-    old = cosine.max(axis=1) >= np.cos(np.sqrt(4.0 * np.pi / state.config.look_directions))
-    return looks if old.all() else Looks.of(looks.chosen[~old], directions)
-
-
 @cache
 def image_rays(config: ActiveVisionConfig) -> Array:
     """Directions (R, 3) in the camera, unit: a square grid over the image within `config.view_cone`.
@@ -110,15 +107,9 @@ def image_rays(config: ActiveVisionConfig) -> Array:
 
 
 def ray_information(voxels: VoxelMap, T_world_camera: Array, rays_camera: Array) -> Array:
-    """Sum the information the rays of each camera gather.
+    """Sum the information (C, 5) that the rays (R, 3), unit, of each camera (C, 4, 4) gather.
 
-    Args:
-        voxels: Where they gather it.
-        T_world_camera: Cameras (C, 4, 4).
-        rays_camera: Unit directions (R, 3) of the rays in the camera.
-
-    Returns:
-        (C, 5), one column per name of `VOLUMETRIC`: [bit] for entropies, [m] for `proximity-count`.
+    It has one column per name of `VOLUMETRIC`: [bit] for entropies, [m] for `proximity-count`.
     """
     occupancy, states = voxels.occupancy, np.ascontiguousarray(voxels.states)
     entropy = -occupancy * np.log2(occupancy) - (1.0 - occupancy) * np.log2(1.0 - occupancy)
