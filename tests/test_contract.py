@@ -48,23 +48,6 @@ class Door:
         """Leave what is kept to others."""
 
 
-class Python(Door):
-    def open(self):
-        self.scene = Scene(**NEW)
-
-    def add(self, view):
-        return graph_text(self.scene.update(view))
-
-    def next(self, poses):
-        return next_best_view(self.scene, candidates=poses).T_world_camera
-
-    def take(self, object_id, T=None):
-        return graph_text(self.scene.removed(object_id) if T is None else self.scene.moved(object_id, T))
-
-    def graph(self):
-        return graph_text(self.scene.graph)
-
-
 class Keeping(Door):
     """A front end of a session in the folder `s`; `told` is its answer to the newest view."""
 
@@ -316,7 +299,7 @@ def test_views_give_the_graph_of_python_and_what_cannot_be_used_changes_nothing(
     assert door.add(views[2]) == graph_of(door.seen) != graph
 
 
-@to(*KEEPING, Python)
+@to(*KEEPING)
 def test_the_next_view_is_one_that_can_be_reached(door, views):
     poses = [view.pose for view in views[1:]]
     assert "no view" in refusal(lambda: door.next(poses))
