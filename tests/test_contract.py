@@ -10,8 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import npy, run_command, wall_of
-from test_ros import Bench, Handle, make, messages, packed
+from test_ros import Bench, Handle, make, packed, transform_message
 from test_service import body, serving
+from test_sessions import contents
 
 from caryatid.config import Config
 from caryatid.errors import CaryatidError, in_one_line
@@ -178,13 +179,8 @@ class Node(Door):
         return self.graph()
 
     def take(self, object_id, T=None):
-        fields = {"object": object_id, "moved": T is not None}
-        if T is not None:
-            pose = messages.pose_message(make, T)
-            shift = make("geometry_msgs/msg/Vector3", x=pose.position.x, y=pose.position.y, z=pose.position.z)
-            fields["motion"] = make(
-                "geometry_msgs/msg/Transform", translation=shift, rotation=pose.orientation
-            )
+        fields = {} if T is None else {"moved": True, "motion": transform_message(T)}
+        fields["object"] = object_id
         told = packed(self.bench.logic.removed(make("caryatid_msgs/srv/Removed/Request", **fields)))
         if not told.success:
             raise CaryatidError(told.message)
@@ -273,12 +269,6 @@ USELESS = [
 ]
 
 
-def contents(door):
-    """All files of a session but the lock, which says nothing."""
-    paths = sorted(p for p in (door.folder / "s").rglob("*") if p.is_file() and p.suffix != ".lock")
-    return {path: path.read_bytes() for path in paths}
-
-
 def graph_of(views):
     scene = Scene(**NEW)
     for view in views:
@@ -291,10 +281,10 @@ def test_views_give_the_graph_of_python_and_what_cannot_be_used_changes_nothing(
     for number, view in enumerate(views[:2], start=1):
         assert door.add(view) == graph_of(door.seen) == door.graph()
         assert len(door.seen) == number
-    graph, seen, kept = door.graph(), list(door.seen), contents(door)
+    graph, seen, kept = door.graph(), list(door.seen), contents(door.folder / "s")
     for change, said in USELESS:
         assert said in refusal(lambda change=change: door.add(change(views[2])))
-        assert (door.graph(), contents(door)) == (graph, kept)
+        assert (door.graph(), contents(door.folder / "s")) == (graph, kept)
     door.seen[:] = seen
     assert door.add(views[2]) == graph_of(door.seen) != graph
 

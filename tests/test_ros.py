@@ -94,6 +94,12 @@ def camera_info(view):
     return make("sensor_msgs/msg/CameraInfo", height=height, width=width, k=view.K.ravel())
 
 
+def transform_message(T):
+    pose = messages.pose_message(make, T)
+    shift = make("geometry_msgs/msg/Vector3", x=pose.position.x, y=pose.position.y, z=pose.position.z)
+    return make("geometry_msgs/msg/Transform", translation=shift, rotation=pose.orientation)
+
+
 class Bench:
     """A robot whose camera takes views, seen through the calls that the logic makes of a node."""
 
@@ -118,12 +124,10 @@ class Bench:
     def lookup(self, target, source, stamp):
         if (target, source) != (self.frame, "lens"):
             raise LookupError("no such frame")
-        pose = messages.pose_message(make, self.T_world_camera)
-        p = make("geometry_msgs/msg/Vector3", x=pose.position.x, y=pose.position.y, z=pose.position.z)
-        still = make("geometry_msgs/msg/Transform", translation=p, rotation=pose.orientation)
+        found = transform_message(self.T_world_camera)
         if stamp is not None:
-            self.poses.append(messages.matrix_of(pose.orientation, pose.position, "view"))
-        return make("geometry_msgs/msg/TransformStamped", transform=still)
+            self.poses.append(messages.matrix_of(found.rotation, found.translation, "view"))
+        return make("geometry_msgs/msg/TransformStamped", transform=found)
 
     def publish(self, name, message):
         self.published.append((name, packed(message)))
