@@ -12,7 +12,7 @@ import pytest
 from conftest import npy, run_command, wall_of
 from test_ros import Bench, Handle, make, packed, transform_message
 from test_service import body, serving
-from test_sessions import contents
+from test_sessions import contents, flip
 
 from caryatid.config import Config
 from caryatid.errors import CaryatidError, in_one_line
@@ -69,8 +69,8 @@ class InPython(Keeping):
     def added(self, view):
         return self.session.add(view).to_json()
 
-    def next(self, poses):
-        return self.session.next(poses).decision.T_world_camera
+    def next(self, poses, lengths=None):
+        return self.session.next(poses, lengths).to_json()
 
     def take(self, object_id, T=None):
         return graph_text(self.session.take(object_id, T))
@@ -110,9 +110,9 @@ class CommandLine(Keeping):
             words += [f"--{name}", self.folder / f"{name}.npy"]
         return self.run("add", *words, "--json")
 
-    def next(self, poses):
-        document = {"T_world_camera": [T.tolist() for T in poses]}
-        return self.run("next", "--candidates", self.file("poses.json", document))["T_world_camera"]
+    def next(self, poses, lengths=None):
+        document = {"T_world_camera": [T.tolist() for T in poses], "path_length": lengths}
+        return self.run("next", "--candidates", self.file("poses.json", document))
 
     def take(self, object_id, T=None):
         moved = [] if T is None else ["--moved", self.file("moved.json", {"T": T.tolist()})]
@@ -146,9 +146,9 @@ class Service(Keeping):
     def added(self, view):
         return self.ask("post", "/sessions/s/views", body(view))
 
-    def next(self, poses):
-        document = {"T_world_camera": [T.tolist() for T in poses]}
-        return self.ask("post", "/sessions/s/next", document)["T_world_camera"]
+    def next(self, poses, lengths=None):
+        document = {"T_world_camera": [T.tolist() for T in poses], "path_length": lengths}
+        return self.ask("post", "/sessions/s/next", document)
 
     def take(self, object_id, T=None):
         document = {"object": object_id, "T": None if T is None else T.tolist()}
@@ -294,10 +294,14 @@ def test_the_next_view_is_one_that_can_be_reached(door, views):
     poses = [view.pose for view in views[1:]]
     assert "no view" in refusal(lambda: door.next(poses))
     door.add(views[0])
-    chosen, scene = door.next(poses), Scene(**NEW)
+    assert (door.told["warnings"], door.told["changes"]) == ([], [])
+    np.testing.assert_allclose(door.told["T_world_camera"], views[0].pose, atol=0.02)
+    scene = Scene(**NEW)
     scene.update(views[0])
-    np.testing.assert_allclose(chosen, next_best_view(scene, candidates=poses).T_world_camera, atol=1e-8)
-    np.testing.assert_allclose(door.next(poses[:1]), poses[0], atol=1e-8)
+    for lengths in (None, [9.0, 0.0], [0.0, 9.0]):
+        told, chosen = door.next(poses, lengths), next_best_view(scene, candidates=poses, path_length=lengths)
+        np.testing.assert_allclose(told["T_world_camera"], chosen.T_world_camera, atol=1e-8)
+        assert (told["view"], told["candidate"], told["platform"]) == (1, chosen.index, None)
     far = [transforms.rigid(T[:3, :3], 1e3 * T[:3, 3]) for T in poses]
     assert "give camera poses in metres" in refusal(lambda: door.next(far))
 
@@ -316,12 +320,12 @@ def test_what_the_robot_reports_is_in_the_graph_and_in_that_of_the_next_view(doo
 
 
 @to(*KEEPING)
-@pytest.mark.parametrize("snapshots", [True, False])
+@pytest.mark.parametrize("snapshots", ["whole", "damaged", "gone"])
 def test_what_was_added_is_there_after_reopening_and_undone_step_by_step(door, views, snapshots):
     graphs = [door.graph(), door.add(views[0]), door.take("o2"), door.add(views[1]), door.take("o1", ASIDE)]
     door.close()
-    if not snapshots:
-        shutil.rmtree(door.folder / "s/state")
+    for path in [] if snapshots == "whole" else (door.folder / "s/state").iterdir():
+        path.unlink() if snapshots == "gone" else path.write_bytes(flip(path.read_bytes()))
     with Session.open(door.folder / "s", read_only=True) as session:
         assert (session.views, session.reports) == (2, 2)
         assert graph_text(session.graph) == graphs[-1]

@@ -191,15 +191,6 @@ def flip(content):
     return content[:middle] + bytes([content[middle] ^ 0xFF]) + content[middle + 1 :]
 
 
-def test_a_damaged_snapshot_is_made_again(begun, views, graph_after):
-    for path in (begun / "state").iterdir():
-        path.write_bytes(flip(path.read_bytes()))
-    with Session.open(begun) as session:
-        assert graph_text(session.graph) == graph_after(0, 1)
-        session.add(views[2])
-        assert graph_text(session.graph) == graph_after(0, 1, 2)
-
-
 @pytest.mark.parametrize(("code", "processed"), [("the same", 0), ("other", 2)])
 @pytest.mark.parametrize("segmentation", ["labels", "auto"])
 def test_opening_processes_views_again_only_with_other_code(
