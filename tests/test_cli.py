@@ -273,9 +273,8 @@ def test_without_early_stop_it_looks_until_the_views_are_used_up(tmp_path, recor
     assert len(goes_on.views) == 3
 
 
-@pytest.mark.parametrize("planner", ["support", "random"])
-def test_the_same_seed_gives_the_same_graphs_byte_for_byte(tmp_path, scene_file, planner):
-    options = ["--views", 2, "--no-report", "--noise", "carmine", "--planner", planner, "--seed"]
+def test_the_same_seed_gives_the_same_graphs_byte_for_byte(tmp_path, scene_file):
+    options = ["--views", 2, "--no-report", "--noise", "carmine", "--planner", "random", "--seed"]
     first, again, other = (
         graph_files(explored(scene_file, tmp_path / name, *options, seed).folder)
         for name, seed in (("first", 3), ("again", 3), ("other", 4))

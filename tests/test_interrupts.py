@@ -75,12 +75,13 @@ def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment, number):
     assert len(run.record["scores"]) == len(run.views)
 
 
-def test_a_clearing_that_is_killed_goes_on(tmp_path):
-    words = ["clear", "tower", "--no-report", "--hands", 1, *SMALL]
+def test_a_clearing_that_is_killed_goes_on(tmp_path, scene_file):
+    quick = ["--views", 4, "--risk", 0.5, "--set", "rehearsal.draws=2", *SMALL]
+    words = ["clear", scene_file, "--no-report", "--hands", 1, *quick]
     assert run_command(*words, "--out", tmp_path / "whole", "--quiet") == 0
     whole, folder = read_run(tmp_path / "whole"), tmp_path / "runs" / "run"
     folder.parent.mkdir()
-    for kills, moment in enumerate(["view 1:", "removed", "removed", "removed"]):
+    for kills, moment in enumerate(["view 1:", "removed", "removed"]):
         command = Command(*words, "--out", folder)
         command.wait_for(moment)
         kept = read_run(folder)
@@ -99,8 +100,8 @@ def test_a_clearing_that_is_killed_goes_on(tmp_path):
             assert (view.folder / name).read_bytes() == (known.folder / name).read_bytes()
 
 
-def test_an_interrupted_clearing_says_how_it_goes_on(tmp_path):
-    command = Command("clear", "tower", "--out", tmp_path / "run", *SMALL)
+def test_an_interrupted_clearing_says_how_it_goes_on(tmp_path, scene_file):
+    command = Command("clear", scene_file, "--out", tmp_path / "run", *SMALL)
     command.wait_for("view 2:")
     status, out, told = command.interrupt()
     assert (status, out) == (130, "")

@@ -211,9 +211,13 @@ def begun(words, redirected="", folder=None):
     )  # fmt: skip
 
 
+REDIRECTED = [(command, to) for to in (">&- 2>&-", ">/dev/full") for command in ENDING]
+REDIRECTED += [(command, "") for command in PRINTING]
+"""Without the other commands in a pipe: they print nothing, and so end in /dev/full as they would there."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ENDING)
-@pytest.mark.parametrize("redirected", ["", ">&- 2>&-", ">/dev/full"])
+@pytest.mark.parametrize(("command", "redirected"), REDIRECTED)
 def test_a_command_ends_well_or_in_one_line_whatever_is_missing(command, redirected, words):
     """Also in a folder that nobody, not even root, can write to."""
     process = begun(words(command), redirected, "/sys")

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 from conftest import capture, run_command
 
-from caryatid.errors import CaryatidError
 from caryatid.geometry import transforms
-from caryatid.io import read_recording, write_recording
-from caryatid.sessions import Session
+from caryatid.io import write_recording
 
 pytestmark = pytest.mark.slow
 
@@ -70,42 +68,20 @@ def nonsense(views, rng):
     return f"{error.__name__} {which}", [error(v, rng) if i == which else v for i, v in enumerate(views)]
 
 
-def by_command(command, recording, folder, capsys):
-    """Whether a command refuses a recording in one line, or warns of it."""
-    options = ["--no-report"]
+@pytest.mark.parametrize("command", ["extract", "explore"])
+def test_nonsense_is_refused_in_one_line_or_warned_of(command, tmp_path, capsys):
+    """Sessions, and so the service, refuse what `extract` refuses or warns of."""
+    recording, run = tmp_path / "recording", tmp_path / "run"
+    options = ["--out", run, "--quiet", "--no-report"]
     if command == "explore":
         options.append("--no-early-stop")  # otherwise it may not look at a wrong view
-    status = run_command(command, recording, "--out", folder / "run", "--quiet", *options)
-    assert (status, capsys.readouterr().err.count("\n")) in ((0, 0), (1, 1))
-    return status == 1 or bool(json.loads((folder / "run/run.json").read_text())["warnings"])
-
-
-def by_session(recording, folder):
-    """Whether a session, and so the service, refuses a view of a recording, or warns of it."""
-    warned = False
-    with Session.begin(folder / "session", segmentation="labels") as session:
-        for view in read_recording(recording):
-            try:
-                warned |= bool(session.add(view).warnings)
-            except CaryatidError:
-                warned = True
-    shutil.rmtree(folder / "session")
-    return warned
-
-
-@pytest.mark.parametrize("door", ["extract", "explore", "session"])
-def test_nonsense_is_refused_or_warned_of(door, tmp_path, capsys):
-    views = capture("clutter", (180.0, 60.0, -60.0))
-    silent = []
+    views, silent = capture("clutter", (180.0, 60.0, -60.0)), []
     for case in range(100):
         what, wrong = nonsense(views, np.random.default_rng([case, 21]))
-        recording = tmp_path / "recording"
         write_recording(recording, wrong)
-        if door == "session":
-            told = by_session(recording, tmp_path)
-        else:
-            told = by_command(door, recording, tmp_path, capsys)
-        if not told:
+        status = run_command(command, recording, *options)
+        assert (status, capsys.readouterr().err.count("\n")) in ((0, 0), (1, 1))
+        if status == 0 and not json.loads((run / "run.json").read_text())["warnings"]:
             silent.append(f"{case}: {what}")
         shutil.rmtree(recording)
     assert len(silent) <= 5, silent

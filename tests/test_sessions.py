@@ -76,21 +76,13 @@ def contents(folder):
 # What a session does
 
 
-def test_views_one_by_one_give_the_graph_of_all_of_them(folder, views, graph_after):
+def test_a_session_keeps_its_options(folder, views):
     config = replace(Config(), report=replace(Config().report, image_width=100))
-    options = {"segmentation": "labels", "seed": 7, "planner": "random"}
-    with Session.begin(folder, config, **options) as session:
-        with pytest.raises(SessionConflictError, match="the next view is 0"):
-            session.add(views[0], number=-1)
-        assert session.add(views[0]).number == 0
-    for number in (1, 2):
-        with Session.open(folder) as session:
-            assert session.beginning.settings == config
-            assert session.beginning.planner == "random"
-            assert graph_text(session.graph) == graph_after(*range(number))
-            added = session.add(views[number])
-            assert (added.number, session.views) == (number, number + 1)
-            assert graph_text(added.graph) == graph_text(session.graph) == graph_after(*range(number + 1))
+    Session.begin(folder, config, planner="random", seed=np.int64(3)).close()
+    with Session.open(folder) as session, pytest.raises(SessionConflictError, match="the next view is 0"):
+        session.add(views[0], number=-1)
+    beginning = session.beginning
+    assert (beginning.settings, beginning.planner, beginning.seed) == (config, "random", 3)
 
 
 def test_the_next_view_is_where_the_robot_can_be(begun):
@@ -140,24 +132,6 @@ def test_a_robot_may_say_itself_what_it_reaches(begun):
                 session.next(poses, wrong)
 
 
-def test_a_view_without_a_table_is_kept_until_one_shows_it(folder, views, graph_after):
-    with Session.begin(folder, segmentation="labels", seed=7) as session:
-        added = session.add(wall_of(views[0]))
-        assert (added.number, added.changed, added.graph.objects) == (0, False, ())
-    shutil.rmtree(folder / "state")
-    with Session.open(folder) as session:
-        with pytest.raises(PlanningError, match="no view shows a table top"):
-            session.next()
-        session.add(views[0])
-        session.undo()
-        added = session.add(views[0])
-        assert (added.number, added.changed, session.views) == (1, True, 2)
-        assert graph_text(added.graph) != graph_after(0)  # of two views
-        assert [o.id for o in added.graph.objects] == ["o0", "o1", "o2"]
-    with Session.open(folder, read_only=True) as session:
-        assert graph_text(session.graph) == graph_text(added.graph)
-
-
 def test_a_kept_view_that_does_not_fit_later_is_ignored_also_after_opening(folder, views):
     """The first view is tilted too much to show a table, and the wall is far from it."""
     first, centre = views[0], np.array([0.0, 0.0, 0.75])
@@ -194,45 +168,18 @@ def test_views_are_counted_since_the_last_report(folder, views):
         assert session.next().stop != "maximum of 1 views reached"
 
 
-def test_undo_goes_back_view_by_view(begun, views, graph_after):
-    with Session.open(begun) as session:
-        session.add(views[2])
-        for left in (2, 1, 0):
-            assert session.undo() == left
-            assert graph_text(session.graph) == graph_after(*range(left))
-        with pytest.raises(SessionConflictError, match="nothing to undo"):
-            session.undo()
-        for number, view in enumerate(reversed(views)):
-            assert session.add(view).number == number
-    with Session.open(begun) as session:
-        assert graph_text(session.graph) == graph_after(2, 1, 0)
-
-
-def test_what_the_robot_reports_stays_and_can_be_taken_back(begun, views):
-    aside, scene = transforms.rigid(np.eye(3), (0.0, 0.1, 0.0)), Scene(segmentation="labels", seed=7)
-    for view in views[:2]:
-        scene.update(view)
-    graphs = [graph_text(scene.graph), graph_text(scene.removed("o2"))]
-    graphs += [graph_text(scene.update(views[2])), graph_text(scene.moved("o1", aside))]
+def test_a_report_counts_once_and_only_if_it_can_be(begun):
     with Session.open(begun) as session:
         for _ in range(2):
             session.take("o2", number=0)
         with pytest.raises(SessionConflictError, match="has number 0, but the next report is 1"):
             session.take("o1", number=0)
-        session.add(views[2])
-        assert graph_text(session.take("o1", aside)) == graphs[-1]
-        before = contents(begun)
-        for change in (lambda: session.take("o9"), lambda: session.take("o1", np.diag([2.0, 1.0, 1.0, 1.0]))):
-            with pytest.raises(InputError):
-                change()
+        before, changes = contents(begun), session.scene.changes
+        with pytest.raises(InputError):
+            session.take("o1", np.diag([2.0, 1.0, 1.0, 1.0]))
         assert contents(begun) == before
-    shutil.rmtree(begun / "state")
     with Session.open(begun) as session:
-        assert session.scene.changes == scene.changes
-        for views_left, graph in ((3, graphs[3]), (3, graphs[2]), (2, graphs[1]), (2, graphs[0])):
-            assert (session.views, graph_text(session.graph)) == (views_left, graph)
-            session.undo()
-        assert session.views == 1
+        assert (session.reports, session.scene.changes) == (1, changes)
 
 
 # Snapshots that cannot be trusted
@@ -242,15 +189,6 @@ def flip(content):
     """Change one byte in the middle."""
     middle = len(content) // 2
     return content[:middle] + bytes([content[middle] ^ 0xFF]) + content[middle + 1 :]
-
-
-def test_a_damaged_snapshot_is_made_again(begun, views, graph_after):
-    for path in (begun / "state").iterdir():
-        path.write_bytes(flip(path.read_bytes()))
-    with Session.open(begun) as session:
-        assert graph_text(session.graph) == graph_after(0, 1)
-        session.add(views[2])
-        assert graph_text(session.graph) == graph_after(0, 1, 2)
 
 
 @pytest.mark.parametrize(("code", "processed"), [("the same", 0), ("other", 2)])
@@ -458,28 +396,12 @@ def with_K(change):
     return lambda v: replace(v, K=change(v.K))
 
 
-def posed(change):
-    return lambda v: v.with_pose(change(v.pose))
-
-
-def shifted(x, y, z):
-    return posed(lambda T: transforms.rigid(T[:3, :3], T[:3, 3] + (x, y, z)))
-
-
 UNUSABLE = {
     "another size": (small, "has 80×60 pixels, .* that of earlier views has 160×120 pixels"),
     "another camera": (with_K(lambda K: K * [[1.2], [1.2], [1.0]]), "that of earlier views has"),
     "no camera": (with_K(lambda K: K * [[1e-9], [1e-9], [1.0]]), "that of earlier views has"),
     "no pose": (lambda v: replace(v, T_world_camera=None), "has no camera pose"),
     "no labels": (lambda v: replace(v, labels=None), "has no labels"),
-    "millimetres": (posed(lambda T: transforms.rigid(T[:3, :3], 1e3 * T[:3, 3])), "as if in millimetres"),
-    "far away": (shifted(9.0, 0.0, 0.0), "none of its points are near the table"),
-    "astronomical": (shifted(1e9, 0.0, 0.0), "from the world's origin"),
-    "below the table": (shifted(0.0, 0.0, -1.2), "below the table top"),
-    "the inverse": (posed(transforms.invert), "wrong camera pose"),
-    "0.4 m too high": (shifted(0.0, 0.0, 0.4), "of its points lie on surfaces of earlier views"),
-    "depth in millimetres": (lambda v: replace(v, depth=1e6 * v.depth), "give depth in metres"),
-    "no readings": (lambda v: replace(v, depth=0.0 * v.depth), "has no depth readings"),
 }
 
 
@@ -599,9 +521,6 @@ def test_a_session_is_not_begun_where_something_is(begun, tmp_path):
     (begun / LOG).unlink()
     with pytest.raises(SessionConflictError):
         Session.begin(begun)
-    with Session.begin(tmp_path / "new", seed=np.int64(3)):
-        pass
-    assert Session.open(tmp_path / "new").beginning.seed == 3
 
 
 BEGUN_OTHERWISE = {

@@ -116,16 +116,14 @@ def test_a_shape_moves_as_a_whole_and_is_not_replaced(step, drawn):
     assert not [name for name in gone if "o2" in name]
 
 
-def test_what_is_hidden_is_not_sent_until_it_is_asked_for(opening, settings):
-    page = LoopPage(opening, settings, segmentation="labels")
-    page.turn()
-    page.wait()
-    sent = {name.split("/")[0] for name, nodes in page.drawing.nodes.items() if nodes}
+def test_what_is_hidden_is_not_sent_until_it_is_asked_for(loop):
+    loop.turn()
+    loop.wait()
+    sent = {name.split("/")[0] for name, nodes in loop.drawing.nodes.items() if nodes}
     assert sent == {"shapes", "names", "supports", "cameras"}
-    page.show_layer("cloud", True)
-    page.wait()
-    assert page.drawing.nodes["cloud"]
-    page.close()
+    loop.show_layer("cloud", True)
+    loop.wait()
+    assert loop.drawing.nodes["cloud"]
 
 
 def test_arrows_tell_direction_doubt_and_kind(step, drawn):
@@ -302,40 +300,44 @@ def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(loop, monkeypatch
 # The page
 
 
-def _waiting(monkeypatch, meanwhile):
-    """Have the command, where it would wait for Ctrl-C, do something else."""
-    monkeypatch.setattr("caryatid.cli.run.wait_for_interrupt", meanwhile)
-
-
-def test_view_serves_a_run_to_this_machine_until_it_is_stopped(scene_file, tmp_path, monkeypatch, capsys):
-    folder, served, shown = tmp_path / "run", [], []
-    options = ("--views", 3, "--no-report", "--quiet", "--noise", "carmine", *SMALL)
-    assert run_command("explore", scene_file, "--out", folder, *options) == 0
-    add = Page.add
+@pytest.fixture
+def shown(monkeypatch):
+    """The steps that are shown, with their F1."""
+    shown, add = [], Page.add
     monkeypatch.setattr(Page, "add", lambda page, *step: (shown.append(step), add(page, *step)))
+    return shown
 
-    def meanwhile():
+
+@pytest.fixture
+def meanwhile(monkeypatch):
+    """Have the command, where it would wait for Ctrl-C, do something else."""
+    return lambda work: monkeypatch.setattr("caryatid.cli.run.wait_for_interrupt", work)
+
+
+def test_view_serves_a_run_to_this_machine_until_it_is_stopped(kept_run, meanwhile, shown, capsys):
+    served = []
+
+    def ask():
         address = re.search(r"http://\S+", capsys.readouterr().err)[0]  # what programs take for the address
         served.append((address, urllib.request.urlopen(address).read()))
 
-    _waiting(monkeypatch, meanwhile)
-    assert run_command("view", folder, "--no-browser", "--port", 0) == 0
+    meanwhile(ask)
+    assert run_command("view", kept_run, "--no-browser", "--port", 0) == 0
     ((address, content),) = served
     assert address.startswith("http://127.0.0.1:")
     assert b"<html" in content
-    assert len(shown) == len(read_run(folder).views) > 1
+    assert len(shown) == len(read_run(kept_run).views) > 1
     assert all(len(step.cloud) and f1 is not None for step, f1 in shown)
     with pytest.raises(OSError, match="refused"):
         urllib.request.urlopen(address)
 
 
-def test_a_built_in_scene_comes_before_a_run_of_its_name(kept_run, tmp_path, monkeypatch, capsys):
+def test_a_built_in_scene_comes_before_a_run_of_its_name(
+    kept_run, tmp_path, monkeypatch, meanwhile, shown, capsys
+):
     shutil.copytree(kept_run, tmp_path / "tower")
     monkeypatch.chdir(tmp_path)
-    shown = []
-    _waiting(monkeypatch, lambda: None)
-    add = Page.add
-    monkeypatch.setattr(Page, "add", lambda page, *step: (shown.append(step), add(page, *step)))
+    meanwhile(lambda: None)
     for source, views in (("tower", 1), ("./tower", 2)):
         shown.clear()
         assert run_command("view", source, "--no-browser", "--port", 0, *SMALL) == 0
@@ -390,10 +392,10 @@ def test_view_says_in_one_line_what_it_cannot_show_or_where_it_cannot_listen(kep
 
 
 @pytest.mark.slow
-def test_explore_shows_its_views_while_it_works(scene_file, tmp_path, monkeypatch, capsys):
+def test_explore_shows_its_views_while_it_works(scene_file, tmp_path, monkeypatch, meanwhile, capsys):
     pages = []
     monkeypatch.setattr("webbrowser.open", pages.append)
-    _waiting(monkeypatch, lambda: pages.append(urllib.request.urlopen(pages[0]).status))
+    meanwhile(lambda: pages.append(urllib.request.urlopen(pages[0]).status))
     options = ("--out", tmp_path / "run", "--views", 2, "--view", "--no-report", *SMALL)
     assert run_command("explore", scene_file, *options) == 0
     assert pages[1] == 200
@@ -403,10 +405,10 @@ def test_explore_shows_its_views_while_it_works(scene_file, tmp_path, monkeypatc
 
 
 @pytest.mark.slow
-def test_an_exploration_that_is_interrupted_is_kept_and_its_page_closed(scene_file, tmp_path, monkeypatch):
+def test_an_interrupted_exploration_is_kept_and_its_page_closed(scene_file, tmp_path, monkeypatch, meanwhile):
     shown, waited = [], []
     monkeypatch.setattr("webbrowser.open", lambda url: None)
-    _waiting(monkeypatch, lambda: waited.append(True))
+    meanwhile(lambda: waited.append(True))
     whole = Page.add
 
     def interrupted(page, step, f1):
