@@ -400,10 +400,19 @@ def explore(
     until: float | None = None,
     early_stop: bool = True,
 ) -> Iterator[Step]:
-    """Explore until no view is worth its path, or `config.active.max_views` is reached.
+    """Explore until no view is worth its path, or `max_views` is reached.
 
-    With `early_stop`, it may stop before, by `config.active.stop` and `until`. The other arguments are as in
-    `Explorer`.
+    Args:
+        camera: Camera that takes the views.
+        robot: Robot, placed at the first view.
+        planner: Planner of the next view, or its name.
+        config: Settings of all stages; `config.active.max_views` limits the views.
+        segmentation: `labels`, `auto`, or None to use labels if available.
+        seed: Seed of every random choice.
+        masks: Source of masks, or None to use those of the views.
+        goal: As for `Explorer`.
+        until: As for `Explorer`.
+        early_stop: Whether to stop before `max_views`, by `config.active.stop` and `until`.
 
     Yields:
         A step after each view; the last one again, with `stop`, if the robot can go to no further view.
