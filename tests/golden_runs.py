@@ -55,6 +55,7 @@ RUNS = {
     "plank-labels": Run("explore leaning_plank --views 3 --noise none --planner paper --seed 3", slow=False),
     "dense-auto": Run("explore dense-12-0 --views 4 --noise carmine --segmentation auto --no-early-stop"),
     "packed-auto": Run("explore packed-20-0 --views 3 --noise carmine --segmentation auto --no-early-stop"),
+    "clutter-paper": Run("explore clutter --views 3 --preset paper --noise carmine --seed 1", slow=False),
     "pile-sg": Run("explore pile-8-3 --views 3 --noise carmine --fusion sg", slow=False),
     "tower-pc-auto": Run(
         "explore tower --views 3 --noise none --segmentation auto --fusion pc --planner occlusion-aware"

@@ -116,7 +116,27 @@ def test_what_a_new_view_calls_otherwise_gets_its_old_name():
     assert {o.id: o.label for o in fused.objects} == {"o0": table_object().label, "o1": 1, "o2": 2}
 
 
+def test_a_new_object_gets_a_name_that_was_never_used():
+    stranger = graph(("o0", "o1"), shapes={1: BALL})
+    names = match(FULL.objects, stranger.objects, SG)
+    graphs, names = fuse(together(FULL), stranger, names, whole=True)
+    assert names["o1"] == "o3"
+    fused = unite_graphs(graphs, SG)
+    assert [(o.id, o.label) for o in fused.objects[1:]] == [("o1", 1), ("o2", 2), ("o3", 3)]
+    assert [s.pair for s in fused.supports] == [("o0", "o1"), ("o0", "o3"), ("o1", "o2")]
+
+
 GONE = graph(("o0", "o1"), shapes={1: CRATE})
+
+
+def test_a_view_that_shows_one_end_alone_says_nothing_of_an_edge():
+    """The cloud so far still touches in view 2, which shows the lower object only, and no more in view 3."""
+    all_ids, lower = frozenset({"o0", "o1", "o2"}), frozenset({"o0", "o1"})
+    apart = graph(("o0", "o1"), ("o0", "o2"))
+    fused = fused_of(FULL, FULL, apart, config=BOTH, shown=(all_ids, lower, all_ids))
+    found = {s.pair: (s.occurrences, s.opportunities) for s in fused.supports}
+    assert found == {("o0", "o1"): (3, 3), ("o0", "o2"): (1, 2)}
+    assert [o.occurrences for o in fused.objects] == [3, 3, 2]
 
 
 def test_occurrences_and_opportunities_are_counted():

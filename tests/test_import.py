@@ -423,6 +423,44 @@ def tree_with(*links, gap=1.0):
     return tree
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_chains_up_and_down_the_tree_multiply(seed):
+    rng = np.random.default_rng(seed)
+    A, B, C, D = (random_motion(rng) for _ in range(4))
+    links = ("map", "odom", START, A), ("odom", "base", START, B), ("odom", "hand", START, D)
+    tree = tree_with(*links, ("base", "eye", 0, C, True))
+    assert np.allclose(tree.between("map", "eye", START), A @ B @ C)
+    assert np.allclose(tree.between("eye", "map", START), np.linalg.inv(A @ B @ C))
+    assert np.allclose(tree.between("hand", "eye", START), np.linalg.inv(D) @ B @ C)
+    assert np.allclose(tree.between("odom", "odom", START), np.eye(4))
+
+
+@pytest.mark.parametrize(("seed", "share"), enumerate((0.0, 0.1, 0.37, 0.5, 1.0)))
+def test_between_two_poses_the_path_is_straight_and_the_turn_even(seed, share):
+    rng = np.random.default_rng(seed)
+    start = random_motion(rng)
+    axis, angle, way = transforms.unit(rng.normal(size=3)), rng.uniform(0.0, 3.0), rng.normal(size=3)
+
+    def after(part):
+        R = start[:3, :3] @ transforms.rotation_from_vector(part * angle * axis)
+        return transforms.rigid(R, start[:3, 3] + part * way)
+
+    tree = tree_with(("map", "eye", START, start), ("map", "eye", START + SECOND // 2, after(1.0)))
+    nanoseconds = round(share * (SECOND // 2))
+    exact = after(nanoseconds / (SECOND // 2))
+    assert np.allclose(tree.between("map", "eye", START + nanoseconds), exact, atol=1e-7)
+
+
+def test_poses_may_come_in_any_order_and_the_last_of_a_time_counts():
+    rng = np.random.default_rng(0)
+    first, last, other = (random_motion(rng) for _ in range(3))
+    tree = tree_with(
+        ("map", "eye", START + SECOND, last), ("map", "eye", START, other), ("map", "eye", START, first)
+    )
+    assert np.allclose(tree.between("map", "eye", START), first)
+    assert np.allclose(tree.between("map", "eye", START + SECOND), last)
+
+
 @pytest.mark.parametrize("late", [-1, SECOND + 1, 3 * SECOND])
 def test_no_pose_is_invented_outside_the_messages_or_across_a_gap(late):
     rng = np.random.default_rng(1)

@@ -294,6 +294,8 @@ class TestInfer:
         (lambda graph: predict_removal(graph, "o9", CONFIG), "not an object of the graph"),
         (lambda graph: predict_removal(graph, "o0", CONFIG), "support surface"),
         (lambda graph: infer([*tower(), tower()[1]], CONFIG), "same id"),
+        (lambda graph: infer_by_area([*tower(), tower()[1]], PAPER), "same id"),
+        (lambda graph: infer(tower(), PAPER), "infer_by_area"),
         (lambda graph: find_contacts([cube(0, 0, 0), cube(0, 0, 0.1)], -0.001), "margin"),
         (lambda graph: find_contacts([cube(0, 0, 0), cube(0, 0, 0.1)], float("nan")), "margin"),
     ],

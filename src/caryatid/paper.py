@@ -35,7 +35,7 @@ from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.support.equilibrium import touching
-from caryatid.support.relations import make_support, nearest_contacts
+from caryatid.support.relations import make_support, nearest_contacts, order_objects
 from caryatid.support.stability import assess
 
 
@@ -130,8 +130,11 @@ def infer_by_area(objects: Sequence[SceneObject], config: SupportConfig) -> Supp
     Args:
         objects: Shapes in the world frame; nothing supports the one with role `support_surface`.
         config: The stage's numbers.
+
+    Raises:
+        InputError: Two objects have the same id.
     """
-    ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
+    ordered = order_objects(objects)
     nearest = nearest_contacts(ordered, touching(ordered, config.contact_margin))
     below = {pair: c for pair, c in nearest.items() if c.tilt <= config.max_tilt}
     stability: dict[str, Stability] = {}

@@ -82,7 +82,7 @@ class Scene(Pictured):
         timings: Time of each stage of the newest update [s].
     """
 
-    def __new__(cls, config: Config | None = None, **_: Any) -> Scene:
+    def __new__(cls, config: Config | None = None, *_: Any, **__: Any) -> Scene:
         """Make a scene; `caryatid.paper` has the classes for settings of the paper."""
         chosen = cls is Scene and isinstance(config, Config)
         scene: Scene = object.__new__(call("scene", config) if chosen else cls)
@@ -98,6 +98,9 @@ class Scene(Pictured):
         if seed < 0:
             raise InputError("seed", f"{seed} is negative", "give an integer of at least 0")
         self.config = config or Config()
+        if not isinstance(self, kind := call("scene", self.config)):
+            remedy = f"derive {type(self).__name__} from caryatid.paper.{kind.__name__}"
+            raise InputError("config", "has settings of the paper, which this class lacks", remedy)
         self.segmentation = segmentation
         self.seed = seed
         self.graph = SupportGraph()

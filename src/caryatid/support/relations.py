@@ -90,11 +90,11 @@ def infer(
         The graph, with the supports that are at least as likely as not.
 
     Raises:
-        InputError: Two objects have the same id.
+        InputError: Two objects have the same id, or `stability` is `area`.
     """
-    if len({o.id for o in objects}) < len(objects):
-        raise InputError("objects", "two of them have the same id", "give each object a unique id")
-    ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
+    if config.stability == "area":
+        raise InputError("support.stability", "is 'area'", "use caryatid.paper.infer_by_area")
+    ordered = order_objects(objects)
     found = support_forces(ordered, config, rng or np.random.default_rng(0))
     supports = [
         make_support(ordered, c, config, float(found.shares[a, b]), found.forces[a, b])
@@ -110,6 +110,17 @@ def infer(
     stability = {o.id: assess(o.shape, patches[o.id], config) for o in ordered if o.id in patches}
     named = tuple(replace(o, probability=float(p)) for o, p in zip(ordered, found.likeness, strict=True))
     return SupportGraph(named, tuple(supports), stability)
+
+
+def order_objects(objects: Sequence[SceneObject]) -> tuple[SceneObject, ...]:
+    """Put the support surface first, then the objects by label.
+
+    Raises:
+        InputError: Two objects have the same id.
+    """
+    if len({o.id for o in objects}) < len(objects):
+        raise InputError("objects", "two of them have the same id", "give each object a unique id")
+    return tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
 
 
 def explain(graph: SupportGraph, supporter: str, supported: str, config: SupportConfig) -> str:
