@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
@@ -80,7 +81,7 @@ class Simulated(Spread):
 
 
 @dataclass(frozen=True)
-class OnScenes(Simulated):
+class OnScenes(Simulated, ABC):
     """A benchmark that explores simulated scenes; subclasses say what is measured and how it is summed up."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
@@ -90,13 +91,13 @@ class OnScenes(Simulated):
     groups: ClassVar[str] = "family"
     """Column whose values each get a summary."""
 
+    @abstractmethod
     def measure(self, name: str) -> list[Row]:
         """Measure one scene."""
-        raise NotImplementedError
 
+    @abstractmethod
     def summary(self, rows: pd.DataFrame) -> dict[str, float]:
         """Sum up rows."""
-        raise NotImplementedError
 
     def remark(self, row: Row) -> str:
         """What to print of a row; by default nothing."""

@@ -20,7 +20,7 @@ from caryatid.config import FusionConfig
 from caryatid.geometry.shapes import Box
 from caryatid.graph import Support, SupportGraph
 from caryatid.objects.fusion import changed, fuse, fused_graph
-from caryatid.paper import match, merge_sightings, unite_graphs
+from caryatid.paper import match_by_shape, merge_sightings, unite_graphs
 
 SG, PC, BOTH = (FusionConfig(method=m) for m in ("sg", "pc", "pc+sg"))
 CRATE = box((0.0, 0.0, 0.8), (0.1, 0.12, 0.1))
@@ -87,17 +87,17 @@ def on_its_side(shape):
     ],
 )
 def test_place_size_and_orientation_tell_whether_two_are_the_same(known, seen, same):
-    assert match([thing(1, known)], [thing(9, seen)], SG) == ({"o9": "o1"} if same else {})
+    assert match_by_shape([thing(1, known)], [thing(9, seen)], SG) == ({"o9": "o1"} if same else {})
 
 
 def test_each_is_matched_to_one_and_all_together_as_well_as_can_be():
     first, second = CRATE, CRATE.moved(shift(0.04))
     known = [thing(1, first), thing(2, second)]
     seen = [thing(7, first.moved(shift(0.018))), thing(8, second.moved(shift(0.018)))]
-    assert match(known, seen, SG) == {"o7": "o1", "o8": "o2"}
-    assert len(match(known[:1], seen, SG)) == 1
+    assert match_by_shape(known, seen, SG) == {"o7": "o1", "o8": "o2"}
+    assert len(match_by_shape(known[:1], seen, SG)) == 1
     for places in ([thing(1, BOXED), thing(2, CAN)], [thing(1, CAN), thing(2, BOXED)]):
-        found = match(places, [thing(9, CAN)], SG)["o9"]
+        found = match_by_shape(places, [thing(9, CAN)], SG)["o9"]
         assert {o.id: o.shape.kind for o in places}[found] == "cylinder"
 
 
@@ -106,7 +106,7 @@ def test_each_is_matched_to_one_and_all_together_as_well_as_can_be():
 
 def test_what_a_new_view_calls_otherwise_gets_its_old_name():
     other_names = graph(("o0", "o2"), ("o2", "o1"), shapes={1: CAN, 2: CRATE})
-    names = match(FULL.objects, other_names.objects, SG)
+    names = match_by_shape(FULL.objects, other_names.objects, SG)
     graphs, names = fuse(together(FULL), other_names, names, whole=True)
     assert names == {"o0": "o0", "o1": "o2", "o2": "o1"}
     fused = unite_graphs(graphs, SG)
@@ -118,7 +118,7 @@ def test_what_a_new_view_calls_otherwise_gets_its_old_name():
 
 def test_a_new_object_gets_a_name_that_was_never_used():
     stranger = graph(("o0", "o1"), shapes={1: BALL})
-    names = match(FULL.objects, stranger.objects, SG)
+    names = match_by_shape(FULL.objects, stranger.objects, SG)
     graphs, names = fuse(together(FULL), stranger, names, whole=True)
     assert names["o1"] == "o3"
     fused = unite_graphs(graphs, SG)

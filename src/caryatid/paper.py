@@ -21,13 +21,13 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import LIKELY, SceneObject, Stability, Support, SupportGraph
 from caryatid.objects.fusion import (
     Graphs,
-    arranged,
+    arrange_graph,
+    average_belief,
     axes_rotation,
-    by_view,
     extents_ratio,
-    mean_belief,
-    turns_to,
-    views_showing,
+    find_turns,
+    find_views_showing,
+    group_by_view,
 )
 from caryatid.scene import Scene
 from caryatid.segmentation.observation import Observation
@@ -35,7 +35,7 @@ from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.support.equilibrium import touching
-from caryatid.support.relations import make_support, nearest_contacts, order_objects
+from caryatid.support.relations import make_support, nearest_contacts, sort_objects
 from caryatid.support.stability import assess
 
 
@@ -53,20 +53,20 @@ class PaperScene(Scene):
     def _named(self, source: View | Cloud) -> bool:
         return self.config.fusion.matching == "points" and super()._named(source)
 
-    def _rename(self, names: dict[str, str]) -> None:
+    def _rename_objects(self, names: dict[str, str]) -> None:
         if self.config.fusion.matching == "points":
-            super()._rename(names)
+            super()._rename_objects(names)
 
-    def _matched(self, newest: SupportGraph, given: bool) -> dict[str, str] | None:
+    def _match_objects(self, newest: SupportGraph, given: bool) -> dict[str, str] | None:
         if self.config.fusion.matching == "points":
-            return super()._matched(newest, given)
-        vertices = [seen[max(seen)] for seen in by_view(self._graphs)[0].values()]
-        return match(vertices, newest.objects, self.config.fusion)
+            return super()._match_objects(newest, given)
+        vertices = [seen[max(seen)] for seen in group_by_view(self._graphs)[0].values()]
+        return match_by_shape(vertices, newest.objects, self.config.fusion)
 
-    def _supported(self, objects: Sequence[SceneObject]) -> SupportGraph:
+    def _infer_supports(self, objects: Sequence[SceneObject]) -> SupportGraph:
         if self.config.support.stability == "area":
             return infer_by_area(objects, self.config.support)
-        return super()._supported(objects)
+        return super()._infer_supports(objects)
 
 
 class ViewScene(PaperScene):
@@ -76,17 +76,17 @@ class ViewScene(PaperScene):
         label = super()._label_of(object_id)
         return label if self.identified or label in self._ids else None
 
-    def _associated(
+    def _associate_segments(
         self, observation: Observation, given: bool, new: dict[int, str]
     ) -> tuple[Observation, dict[int, str]]:
-        return super()._associated(observation, given, new) if given else (observation, new)
+        return super()._associate_segments(observation, given, new) if given else (observation, new)
 
-    def _known(self) -> list[SceneObject]:
+    def _list_known_objects(self) -> list[SceneObject]:
         # The models have the newest view's objects alone.
         return [o for o in self.graph.objects if o.role == "object"]
 
-    def _appeared(self, observation: Observation, voxels: VoxelMap) -> dict[int, str]:
-        return super()._appeared(observation, voxels) if self.identified else {}
+    def _find_appeared(self, observation: Observation, voxels: VoxelMap) -> dict[int, str]:
+        return super()._find_appeared(observation, voxels) if self.identified else {}
 
     def _bounds(self, observation: Observation) -> tuple[SupportSurface, VoxelMap]:
         """Add the view to the map; return the limits of hidden extents, of this view alone."""
@@ -97,13 +97,8 @@ class ViewScene(PaperScene):
             voxels = voxels.integrate(observation.view, self.config.cloud.max_depth)
         return observation.surface, voxels
 
-    def _formed(
-        self,
-        observation: Observation,
-        shown: set[int],
-        surface: SupportSurface,
-        voxels: VoxelMap,
-        given: bool,
+    def _form_objects(
+        self, observation: Observation, shown: set[int], voxels: VoxelMap, table: Array, given: bool
     ) -> Observation:
         self._models.fit_newest(set(observation.shown) - {0, SUPPORT_LABEL}, voxels)
         return observation
@@ -111,13 +106,13 @@ class ViewScene(PaperScene):
     def _surfaces(self) -> dict[str, tuple[Array, Array]]:
         return {o.id: o.shape.surface(0.01) for o in self.graph.objects if o.role == "object"}
 
-    def _matched(self, newest: SupportGraph, given: bool) -> dict[str, str] | None:
+    def _match_objects(self, newest: SupportGraph, given: bool) -> dict[str, str] | None:
         if given and self.config.fusion.matching == "points":
-            return super()._matched(newest, given)
-        vertices = [merge_sightings([*seen.values()]) for seen in by_view(self._graphs)[0].values()]
-        return match(vertices, newest.objects, self.config.fusion)
+            return super()._match_objects(newest, given)
+        vertices = [merge_sightings([*seen.values()]) for seen in group_by_view(self._graphs)[0].values()]
+        return match_by_shape(vertices, newest.objects, self.config.fusion)
 
-    def _fused_graph(self) -> SupportGraph:
+    def _fuse_graphs(self) -> SupportGraph:
         return unite_graphs(self._graphs, self.config.fusion, shown=self._shown)
 
 
@@ -134,7 +129,7 @@ def infer_by_area(objects: Sequence[SceneObject], config: SupportConfig) -> Supp
     Raises:
         InputError: Two objects have the same id.
     """
-    ordered = order_objects(objects)
+    ordered = sort_objects(objects)
     nearest = nearest_contacts(ordered, touching(ordered, config.contact_margin))
     below = {pair: c for pair, c in nearest.items() if c.tilt <= config.max_tilt}
     stability: dict[str, Stability] = {}
@@ -161,8 +156,8 @@ def unite_graphs(
         shown: Ids of the objects each view showed; without it, those in its graph. Only a view that showed
             both ends could have shown an edge.
     """
-    sightings, edges = by_view(graphs)
-    showing = views_showing(graphs, shown)
+    sightings, edges = group_by_view(graphs)
+    showing = find_views_showing(graphs, shown)
     objects = [
         replace(merge_sightings([*seen.values()]), occurrences=len(showing[i]), opportunities=len(showing[i]))
         for i, seen in sightings.items()
@@ -175,13 +170,15 @@ def unite_graphs(
             continue
         last = replace(found[max(found)], certain=any(s.certain for s in found.values()))
         if last.probability is not None and views:
-            last = replace(last, probability=mean_belief(found, views))
+            last = replace(last, probability=average_belief(found, views))
         if last.belief >= LIKELY:
             supports.append(replace(last, occurrences=occurrences, opportunities=len(views)))
-    return arranged(objects, supports)
+    return arrange_graph(objects, supports)
 
 
-def match(known: Sequence[SceneObject], seen: Sequence[SceneObject], config: FusionConfig) -> dict[str, str]:
+def match_by_shape(
+    known: Sequence[SceneObject], seen: Sequence[SceneObject], config: FusionConfig
+) -> dict[str, str]:
     """Match objects one to one by shape, position, orientation and extent.
 
     Args:
@@ -266,7 +263,7 @@ def _merged_sides(
     T = np.array([o.shape.T_world_object for o in same])
     extents = np.array([o.shape.extents for o in same])
     round_ = isinstance(best.shape, Cylinder)
-    turns = turns_to(T[:, :3, :3], best.shape.T_world_object[:3, :3], round_)
+    turns = find_turns(T[:, :3, :3], best.shape.T_world_object[:3, :3], round_)
     R = _mean_axes(np.average(T[:, :3, :3] @ turns, axis=0, weights=weights), round_)
     middles = T[:, :3, 3] @ R
     half = np.abs(np.einsum("kij,ki->kj", turns, extents))[:, :, None] / 2.0

@@ -404,7 +404,7 @@ class Scene(Pictured):
             unexplained = observation.cloud.select(~np.isin(observation.labels, explained))
             check_free(unexplained, self.surface, before, self.config)
         if not named:
-            observation, new = self._associated(observation, given, new)
+            observation, new = self._associate_segments(observation, given, new)
         if named and self.views:
             self._check_identity(observation, source.name)
         shown = self._models.add(observation, self.views) | moved
@@ -412,7 +412,8 @@ class Scene(Pictured):
         surface, voxels = self._bounds(observation)
         watch.lap("map")
         below = voxels.closed_below(surface.outline_world, surface.normal_world)
-        observation = self._formed(observation, shown, surface, below, given)
+        table = observation.footprint(surface, self.config.explanation.spacing)
+        observation = self._form_objects(observation, shown, below, table, given)
         if not named:
             observation, new = self._reidentified(observation, new)
         watch.lap("fit")
@@ -436,16 +437,18 @@ class Scene(Pictured):
             return False
         return self.config.fusion.masks == "scene"
 
-    def _known(self) -> list[SceneObject]:
+    def _list_known_objects(self) -> list[SceneObject]:
         """The objects that new segments may belong to."""
         return self._models.objects()
 
-    def _associated(
+    def _associate_segments(
         self, observation: Observation, given: bool, new: dict[int, str]
     ) -> tuple[Observation, dict[int, str]]:
         """Give segments, and those among them that are new, the labels of their objects."""
         segments = observation.labels
-        observation = self._models.associate(observation, self._known(), masks=given, new=new.keys())
+        observation = self._models.associate(
+            observation, self._list_known_objects(), masks=given, new=new.keys()
+        )
         return observation, {int(observation.labels[segments == k][0]): why for k, why in new.items()}
 
     def _check_identity(self, observation: Observation, name: str) -> None:
@@ -534,17 +537,11 @@ class Scene(Pictured):
             self.voxels = self.voxels.integrate(observation.view, self.config.cloud.max_depth)
         return self.surface or observation.surface, self.voxels
 
-    def _formed(
-        self,
-        observation: Observation,
-        shown: set[int],
-        surface: SupportSurface,
-        voxels: VoxelMap,
-        given: bool,
+    def _form_objects(
+        self, observation: Observation, shown: set[int], voxels: VoxelMap, table: Array, given: bool
     ) -> Observation:
         """Fit the objects this view changed; split and merge automatic segments as the shapes suggest."""
         self._models.fit_all(shown, voxels)
-        table = observation.footprint(surface, self.config.explanation.spacing)
         if self.identified:
             self._models.form(shown, voxels, table)
             return observation
@@ -558,10 +555,10 @@ class Scene(Pictured):
     def _renamed(self, observation: Observation, given_up: Mapping[int, int]) -> Observation:
         """Relabel objects, now and in the graphs so far: old → new."""
         if given_up:
-            self._rename({object_id(old): object_id(new) for old, new in given_up.items()})
+            self._rename_objects({object_id(old): object_id(new) for old, new in given_up.items()})
         return observation.relabelled(dict(given_up))
 
-    def _rename(self, names: dict[str, str]) -> None:
+    def _rename_objects(self, names: dict[str, str]) -> None:
         """Rename objects in the graphs so far: old → new id."""
         self._graphs = tuple(renamed(graph, names) for graph in self._graphs)
         self._shown = tuple(frozenset(names.get(i, i) for i in ids) for ids in self._shown)
@@ -579,7 +576,7 @@ class Scene(Pictured):
         if view is None or voxels is None or registration is None or not registration.aligned:
             return {}, {}
         missing = self._detector.missing(view, self._surfaces())
-        new = self._appeared(observation, voxels)
+        new = self._find_appeared(observation, voxels)
         if self.identified:
             moved = {object_id(k): why for k, why in new.items() if k in self._models.points.objects}
             missing = moved | missing
@@ -598,7 +595,7 @@ class Scene(Pictured):
             self.voxels = self.voxels.forgotten(which & (self.voxels.hits == 0))
         return missing, new
 
-    def _appeared(self, observation: Observation, voxels: VoxelMap) -> dict[int, str]:
+    def _find_appeared(self, observation: Observation, voxels: VoxelMap) -> dict[int, str]:
         """Labels of the segments in space that was free, each with a reason."""
         assert observation.view is not None
         rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
@@ -629,16 +626,16 @@ class Scene(Pictured):
         if self.config.completion.enabled:
             fitted = complete(fitted, surface, voxels, self.config.completion)
         table = SceneObject(SUPPORT_SURFACE_ID, SUPPORT_LABEL, surface.shape, "support_surface")
-        return self._supported(reconcile([table, *fitted], self.config.plausibility))
+        return self._infer_supports(reconcile([table, *fitted], self.config.plausibility))
 
-    def _supported(self, objects: Sequence[SceneObject]) -> SupportGraph:
+    def _infer_supports(self, objects: Sequence[SceneObject]) -> SupportGraph:
         """The support graph of shapes."""
         return infer(objects, self.config.support)
 
     def _fused(self, observation: Observation, newest: SupportGraph, given: bool) -> Observation:
         """Add the newest graph to the earlier ones; its labels become those of the fused objects."""
         whole = self.config.fusion.method == "sg"
-        self._graphs, names = fuse(self._graphs, newest, self._matched(newest, given), whole=whole)
+        self._graphs, names = fuse(self._graphs, newest, self._match_objects(newest, given), whole=whole)
         self._ids = {int(o[1:]): n for o, n in names.items()}
         observation = observation.relabelled({k: int(n[1:]) for k, n in self._ids.items() if k != int(n[1:])})
         seen = {SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(k) for k in observation.shown}
@@ -646,17 +643,17 @@ class Scene(Pictured):
         self._set_graph(renamed(newest, names))
         return observation
 
-    def _matched(self, newest: SupportGraph, given: bool) -> dict[str, str] | None:
+    def _match_objects(self, newest: SupportGraph, given: bool) -> dict[str, str] | None:
         """Known ids of the newest graph's objects; None where a label means the same object in every view."""
         return None
 
-    def _fused_graph(self) -> SupportGraph:
+    def _fuse_graphs(self) -> SupportGraph:
         """The graph of all views."""
         return fused_graph(self._graphs, self.config.fusion, shown=self._shown)
 
     def _set_graph(self, newest: SupportGraph) -> None:
         """Derive the fused graph from all graphs; stability is that of the newest one, with fused ids."""
-        fused = self._fused_graph()
+        fused = self._fuse_graphs()
         ids = {o.id for o in fused.objects}
         stability = {i: verdict for i, verdict in newest.stability.items() if i in ids}
         before, self.graph = self.graph, replace(fused, stability=stability)

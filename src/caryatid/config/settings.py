@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from caryatid.config import Preset
+from caryatid.config.choices import Preset
 from caryatid.config.stages import Config
 from caryatid.errors import InputError
 

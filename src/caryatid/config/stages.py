@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 
-from caryatid.config import FusionMethod, GripperKind, MaskIdentity, ShapeKind
+from caryatid.config.choices import FusionMethod, GripperKind, MaskIdentity, ShapeKind
 
 CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 

@@ -40,7 +40,7 @@ def fuse(
     Returns:
         All graphs, and the fused id of each of the new graph's objects.
     """
-    sightings, _ = by_view(graphs)
+    sightings, _ = group_by_view(graphs)
     if matched is None:
         newest = (seen[max(seen)] for seen in sightings.values())
         by_label = {(o.role, o.label): o.id for o in newest}
@@ -114,8 +114,8 @@ def fused_graph(
         shown: Ids of the objects each view showed; without it, those in its graph. Only a view that showed
             both ends could have shown an edge.
     """
-    newest, (sightings, edges) = len(graphs) - 1, by_view(graphs)
-    showing = views_showing(graphs, shown)
+    newest, (sightings, edges) = len(graphs) - 1, group_by_view(graphs)
+    showing = find_views_showing(graphs, shown)
     disputed = {
         pair[1]
         for pair, found in edges.items()
@@ -137,16 +137,16 @@ def fused_graph(
             continue
         last = found[max(found)]
         if last.probability is not None and views and newest not in found:
-            last = replace(last, probability=mean_belief(found, views))
+            last = replace(last, probability=average_belief(found, views))
         elif last.probability is not None and pair[1] in disputed and newest in found:
             before = found[newest - 1].belief if newest - 1 in found else 0.0
             last = replace(last, probability=(1.0 - _EARLIER) * last.probability + _EARLIER * before)
         if last.belief >= LIKELY:
             supports.append(replace(last, occurrences=occurrences, opportunities=len(views)))
-    return arranged(objects.values(), supports)
+    return arrange_graph(objects.values(), supports)
 
 
-def views_showing(graphs: Graphs, shown: Sequence[frozenset[str]] | None) -> dict[str, set[int]]:
+def find_views_showing(graphs: Graphs, shown: Sequence[frozenset[str]] | None) -> dict[str, set[int]]:
     """Find the views that showed each object; by default, those whose graphs have it."""
     showing: dict[str, set[int]] = {o.id: set() for graph in graphs for o in graph.objects}
     for view, ids in enumerate(shown or [{o.id for o in graph.objects} for graph in graphs]):
@@ -155,12 +155,12 @@ def views_showing(graphs: Graphs, shown: Sequence[frozenset[str]] | None) -> dic
     return showing
 
 
-def mean_belief(found: Mapping[int, Support], views: Set[int]) -> float:
+def average_belief(found: Mapping[int, Support], views: Set[int]) -> float:
     """Average the belief in a support over views; one that did not find it counts 0."""
     return sum(found[v].belief for v in views & found.keys()) / len(views)
 
 
-def arranged(objects: Iterable[SceneObject], supports: Iterable[Support]) -> SupportGraph:
+def arrange_graph(objects: Iterable[SceneObject], supports: Iterable[Support]) -> SupportGraph:
     """Make a graph with the support surface first, objects by label, and supports in the order of objects."""
     ordered = sorted(objects, key=lambda o: (o.role != "support_surface", o.label))
     rank = {o.id: k for k, o in enumerate(ordered)}
@@ -177,7 +177,7 @@ def extents_ratio(a: SceneObject, b: SceneObject) -> float:
     return float(np.max(1.0 + np.maximum(excess, 0.0) / np.minimum(first, second)))
 
 
-def by_view(
+def group_by_view(
     graphs: Graphs,
 ) -> tuple[dict[str, dict[int, SceneObject]], dict[Pair, dict[int, Support]]]:
     """Return vertices by id and edges by their ends, each in the views whose graphs have it: view → it."""
@@ -213,14 +213,14 @@ def axes_rotation(shape: Shape, reference: Shape) -> tuple[Array, float]:
     if isinstance(shape, Solid):
         return np.eye(3), float(Rotation.from_matrix(R_reference.T @ R).magnitude())
     round_ = isinstance(shape, Cylinder)
-    turn = turns_to(R[None], R_reference, round_)[0]
+    turn = find_turns(R[None], R_reference, round_)[0]
     if round_:
         return turn, float(transforms.angle_between((R @ turn)[:, 2], R_reference[:, 2]))
     trace = float(np.sum((R @ turn) * R_reference))
     return turn, float(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
-def turns_to(R: Array, R_reference: Array, axis_only: bool) -> Array:
+def find_turns(R: Array, R_reference: Array, axis_only: bool) -> Array:
     """Find the turns (K, 3, 3) within a shape's symmetry that bring axes (K, 3, 3) nearest to (3, 3)."""
     if axis_only:
         flipped = R[:, :, 2] @ R_reference[:, 2] < 0.0

@@ -94,7 +94,7 @@ def infer(
     """
     if config.stability == "area":
         raise InputError("support.stability", "is 'area'", "use caryatid.paper.infer_by_area")
-    ordered = order_objects(objects)
+    ordered = sort_objects(objects)
     found = support_forces(ordered, config, rng or np.random.default_rng(0))
     supports = [
         make_support(ordered, c, config, float(found.shares[a, b]), found.forces[a, b])
@@ -112,7 +112,7 @@ def infer(
     return SupportGraph(named, tuple(supports), stability)
 
 
-def order_objects(objects: Sequence[SceneObject]) -> tuple[SceneObject, ...]:
+def sort_objects(objects: Sequence[SceneObject]) -> tuple[SceneObject, ...]:
     """Put the support surface first, then the objects by label.
 
     Raises:

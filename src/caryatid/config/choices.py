@@ -1,0 +1,22 @@
+"""Names that settings and options choose from."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+FusionMethod = Literal["pc", "sg", "pc+sg"]
+"""What to fuse over views: points, graphs, or both; section III-B."""
+SegmentationMethod = Literal["labels", "auto"]
+"""Source of segments: given labels, or automatic by local convexity."""
+MaskIdentity = Literal["scene", "per-view"]
+"""What a mask's number identifies: an object in all views, or a segment of one view."""
+Preset = Literal["default", "paper"]
+"""Settings to start from: caryatid's defaults, or those of the paper."""
+NoiseModel = Literal["none", "carmine"]
+"""Noise of the simulated camera."""
+ShapeKind = Literal["box", "cylinder", "sphere"]
+"""The primitives."""
+GripperKind = Literal["none", "parallel", "suction"]
+"""Grippers; with none, every object can be grasped."""
+ExportFormat = Literal["mjcf", "urdf", "gltf", "graphml", "dot"]
+"""Export formats of a scene model."""
