@@ -128,7 +128,6 @@ SUPPORT = {"supporter": "o0", "supported": "o1", "kind": "bottom-up"}
         (("objects", ...), "'objects' is missing"),
         (("objects", 1, "id", "o0"), "two objects have the id 'o0'"),
         (("objects", 1, "role", "hero"), "hero"),
-        (("objects", 1, "role", "support_surface"), "two support surfaces"),
         (("objects", 1, "label", 70000), "70000"),
         (("objects", 1, "T_world_object", np.diag([2.0, 2, 2, 1]).tolist()), "not a rotation"),
         (("objects", 1, "shape", "banana"), "banana"),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from caryatid.geometry.shapes import Shape, Uncertainty
 from caryatid.geometry.transforms import Array
 from caryatid.runtime import Pictured
+from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -30,9 +31,9 @@ class SceneObject(Pictured):
     """A vertex of the support graph.
 
     Attributes:
-        id: Its name, `o` + label; `o0` is the support surface.
+        id: Its name: `o` + label for an object, `o0` for the main support surface, `s1`, … for the others.
         label: Its number in label images.
-        shape: The fitted primitive, in the world frame. The support surface is a thin box.
+        shape: The fitted primitive, in the world frame. A support surface is a thin box.
         role: `object` or `support_surface`.
         occurrences: Number of views in which it was extracted.
         opportunities: Number of views in which it could have been extracted.
@@ -124,7 +125,7 @@ class SupportGraph(Pictured):
     """G_s = (V, E) of the paper, section III-A, in the order of the objects' labels.
 
     Attributes:
-        objects: The vertices, the support surface first.
+        objects: The vertices, the support surfaces first, the main one before the others.
         supports: The edges.
         stability: Per object id the support area ratio r_s of eq. 1 and the verdict of both tests.
     """
@@ -150,8 +151,13 @@ class SupportGraph(Pictured):
 
     @property
     def support_surface(self) -> SceneObject | None:
-        """The table, or None where none has been found."""
-        return next((o for o in self.objects if o.role == "support_surface"), None)
+        """The main support surface, such as the table; None where none has been found."""
+        return next(iter(self.support_surfaces), None)
+
+    @property
+    def support_surfaces(self) -> tuple[SceneObject, ...]:
+        """All support surfaces, the main one first."""
+        return tuple(o for o in self.objects if o.role == "support_surface")
 
     def support(self, supporter: str, supported: str) -> Support | None:
         """Return the edge between two ids, or None.
@@ -279,9 +285,22 @@ class TakeStep:
 
 
 def object_id(label: int) -> str:
-    """Id of the object with this label."""
-    return f"o{label}"
+    """Id of the object or support surface with this label."""
+    number = SUPPORT_LABEL - label
+    return f"o{label}" if label <= MAX_LABEL else f"s{number}" if number else SUPPORT_SURFACE_ID
+
+
+def label_of(object_id: str) -> int:
+    """Label of the object or support surface with this id."""
+    number = int(object_id[1:])
+    return number if object_id[0] == "o" and number else SUPPORT_LABEL - number
+
+
+def vertex_order(o: SceneObject) -> tuple[bool, int]:
+    """Key that sorts vertices: the support surfaces first, the main one before the others, then by label."""
+    surface = o.role == "support_surface"
+    return not surface, -o.label if surface else o.label
 
 
 SUPPORT_SURFACE_ID = "o0"
-"""Id of the support surface."""
+"""Id of the main support surface."""

@@ -123,7 +123,7 @@ def infer_by_area(objects: Sequence[SceneObject], config: SupportConfig) -> Supp
     a small support area holds it down.
 
     Args:
-        objects: Shapes in the world frame; nothing supports the one with role `support_surface`.
+        objects: Shapes in the world frame; nothing supports those with role `support_surface`.
         config: The stage's numbers.
 
     Raises:

@@ -18,7 +18,15 @@ from caryatid.errors import InputError, NoSurfaceError, WrongViewError, check_ty
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import UP, Array
-from caryatid.graph import SUPPORT_SURFACE_ID, Change, ChangeKind, SceneObject, SupportGraph, object_id
+from caryatid.graph import (
+    SUPPORT_SURFACE_ID,
+    Change,
+    ChangeKind,
+    SceneObject,
+    SupportGraph,
+    label_of,
+    object_id,
+)
 from caryatid.objects.changes import ChangeDetector, appeared
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed, without
 from caryatid.objects.hidden_extents import complete
@@ -298,7 +306,7 @@ class Scene(Pictured):
         for label, known in self._ids.items():
             if known == object_id:
                 return label
-        label = int(object_id[1:])
+        label = label_of(object_id)
         return None if label in self._ids else label
 
     def _reported(self, kind: ChangeKind, object_id: str) -> None:
@@ -636,9 +644,9 @@ class Scene(Pictured):
         """Add the newest graph to the earlier ones; its labels become those of the fused objects."""
         whole = self.config.fusion.method == "sg"
         self._graphs, names = fuse(self._graphs, newest, self._match_objects(newest, given), whole=whole)
-        self._ids = {int(o[1:]): n for o, n in names.items()}
-        observation = observation.relabelled({k: int(n[1:]) for k, n in self._ids.items() if k != int(n[1:])})
-        seen = {SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(k) for k in observation.shown}
+        self._ids = {label_of(o): n for o, n in names.items()}
+        observation = observation.relabelled({k: label_of(n) for k, n in self._ids.items()})
+        seen = set(map(object_id, observation.shown))
         self._shown = (*self._shown, frozenset(seen))
         self._set_graph(renamed(newest, names))
         return observation

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
-from annotated_types import Ge, Gt, Lt
+from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 
 from caryatid.config import RecordingConfig
@@ -19,7 +19,7 @@ from caryatid.io import images
 from caryatid.io.datasets import Dataset, Frame, OpenOptions, find_sample
 from caryatid.io.json_files import Numbers, json_text, parse_json, read_json
 from caryatid.io.staging import StagedFolder
-from caryatid.sensing.views import SUPPORT_LABEL, View, check_intrinsics
+from caryatid.sensing.views import MAX_LABEL, View, check_intrinsics
 
 COLOUR_ENDINGS: Final = (".png", ".jpg", ".jpeg")
 """Files of colour images; the first existing one counts."""
@@ -35,7 +35,7 @@ class _Camera:
 
 @dataclass(frozen=True, slots=True)
 class _Mask:
-    obj_id: Annotated[int, Ge(1), Lt(SUPPORT_LABEL)]
+    obj_id: Annotated[int, Ge(1), Le(MAX_LABEL)]
 
 
 Masks = tuple[tuple[Path, int], ...]
@@ -209,7 +209,7 @@ def _read_masks(folder: Path, known: set[int]) -> dict[int, Masks]:
     mask_folder, path = folder / "mask_visib", folder / "scene_gt.json"
     if not mask_folder.is_dir():
         return {}
-    remedy = f'masks need it: one {{"obj_id": …}} for each, from 1 to {SUPPORT_LABEL - 1}'
+    remedy = f'masks need it: one {{"obj_id": …}} for each, from 1 to {MAX_LABEL}'
     table: dict[int, Masks] = {}
     for frame, masks in parse_json(dict[int, list[_Mask]], read_json(path, remedy), path, remedy).items():
         source = f"{path}: frame {frame}"

@@ -147,8 +147,6 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
     pairs = [(s.supporter, s.supported) for s in given.supports]
     for twice in (i for i, count in Counter(ids).items() if count > 1):
         raise InputError(name, f"two objects have the id '{twice}'", "give each object a unique id")
-    if sum(o.role == "support_surface" for o in given.objects) > 1:
-        raise InputError(name, "has two support surfaces", "keep one; the others are objects")
     for (one, other), count in Counter(pairs).items():
         if one == other:
             raise InputError(name, f"'{one}' supports itself", "remove the edge")

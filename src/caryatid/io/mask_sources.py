@@ -18,7 +18,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.io.images import MASK_MODES, decode_image, read_mask, read_npy
 from caryatid.segmentation.observation import label_image, observe
 from caryatid.sensing.masks import labels_from_masks
-from caryatid.sensing.views import SUPPORT_LABEL, View
+from caryatid.sensing.views import View
 
 MaskSource = Callable[[View], View]
 """Adds masks to a view, as segments of that view alone."""
@@ -152,7 +152,7 @@ class OnnxMasks:
         observation = observe(view, self._config, segmentation="auto", known=None, rng=rng)
         labels = label_image(observation, view)
         boxes = []
-        for label in sorted(set(observation.shown) - {0, SUPPORT_LABEL}):
+        for label in observation.shown_objects:
             rows, columns = np.nonzero(labels == label)
             boxes.append((columns.min(), rows.min(), columns.max() + 1, rows.max() + 1))
         return np.array(boxes, dtype=np.float64).reshape(-1, 4)

@@ -19,7 +19,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.io.datasets import find_sample
 from caryatid.io.staging import read_errors
 from caryatid.sensing.clouds import estimate_normals
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud
+from caryatid.sensing.views import MAX_LABEL, Cloud
 
 Columns = dict[str, NDArray[Any]]
 """Fields of one value per point (N,)."""
@@ -179,8 +179,8 @@ def _labels(columns: Columns, divisor: int, path: Path) -> NDArray[np.int32] | N
         return None
     raw = columns["label"].astype(np.float64)
     labels = raw // divisor
-    if not ((raw >= 0.0) & (raw == np.floor(raw)) & (labels < SUPPORT_LABEL)).all():
-        reason = f"labels are not all integers from 0 to {divisor * SUPPORT_LABEL - 1}"
+    if not ((raw >= 0.0) & (raw == np.floor(raw)) & (labels <= MAX_LABEL)).all():
+        reason = f"labels are not all integers from 0 to {divisor * (MAX_LABEL + 1) - 1}"
         raise InputError(path, reason, "number objects from 1")
     return labels.astype(np.int32)
 

@@ -13,7 +13,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Cylinder, Shape, Sphere
 from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
-from caryatid.graph import LIKELY, SUPPORT_SURFACE_ID, SceneObject, Support, SupportGraph, object_id
+from caryatid.graph import LIKELY, SceneObject, Support, SupportGraph, label_of, object_id, vertex_order
 
 Pair = tuple[str, str]
 Graphs = tuple[SupportGraph, ...]
@@ -82,7 +82,7 @@ def renamed(graph: SupportGraph, names: Mapping[str, str]) -> SupportGraph:
     objects: dict[str, SceneObject] = {}
     for o in graph.objects:
         new_id = names.get(o.id, o.id)
-        named = o if new_id == o.id else replace(o, id=new_id, label=int(new_id[1:]))
+        named = o if new_id == o.id else replace(o, id=new_id, label=label_of(new_id))
         objects.setdefault(new_id, named)
     supports: dict[Pair, Support] = {}
     for s in graph.supports:
@@ -161,8 +161,8 @@ def average_belief(found: Mapping[int, Support], views: Set[int]) -> float:
 
 
 def arrange_graph(objects: Iterable[SceneObject], supports: Iterable[Support]) -> SupportGraph:
-    """Make a graph with the support surface first, objects by label, and supports in the order of objects."""
-    ordered = sorted(objects, key=lambda o: (o.role != "support_surface", o.label))
+    """Make a graph: support surfaces first, objects by label, and supports in the order of objects."""
+    ordered = sorted(objects, key=vertex_order)
     rank = {o.id: k for k, o in enumerate(ordered)}
     edges = sorted(supports, key=lambda s: (rank[s.supporter], rank[s.supported]))
     return SupportGraph(tuple(ordered), tuple(edges))
@@ -193,7 +193,7 @@ def group_by_view(
 
 def _fresh_id(o: SceneObject, taken: set[str]) -> str:
     if o.role == "support_surface":
-        return SUPPORT_SURFACE_ID
+        return object_id(o.label)
     label = o.label
     while object_id(label) in taken:
         label += 1

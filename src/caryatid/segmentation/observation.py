@@ -18,7 +18,7 @@ from caryatid.runtime.parallel import kernel
 from caryatid.segmentation.segments import segment, segment_cloud
 from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
 from caryatid.sensing.clouds import oriented_points, thin
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View
 
 WHOLE = 0.1
 """A piece smaller than this share of a mask's largest body is a crumb [1]; something thin may cut a body."""
@@ -63,8 +63,14 @@ class Observation:
         labels: list[int] = np.unique(self.labels[last_of_run]).tolist()
         return labels
 
+    @property
+    def shown_objects(self) -> list[int]:
+        """Labels of the objects among them."""
+        return [label for label in self.shown if 0 < label <= MAX_LABEL]
+
     def relabelled(self, names: dict[int, int]) -> Observation:
         """Return the observation with some labels changed: old → new."""
+        names = {old: new for old, new in names.items() if old != new}
         if not names:
             return self
         labels = self.labels.copy()

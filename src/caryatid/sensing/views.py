@@ -19,7 +19,9 @@ from caryatid.runtime import Pictured
 from caryatid.sensing.masks import labels_from_masks
 
 SUPPORT_LABEL = 65535
-"""The label of the support surface in label images: the last of 16 bits, so that given labels stay."""
+"""The label of the main support surface in label images: the last of 16 bits, so that given labels stay."""
+MAX_LABEL = 65519
+"""The highest label of an object; those above are of support surfaces, at most 16, downwards from 65535."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,11 +256,11 @@ def check_labels(labels: NDArray[Any], name: str) -> NDArray[Any]:
     if labels.dtype.kind == "f" and (labels != np.rint(labels)).any():
         remedy = "give integers, or for a view a stack of masks (N, H, W)"
         raise InputError(name, "labels are not integers", remedy)
-    if not labels.size or (labels.min() >= 0 and labels.max() < SUPPORT_LABEL):
+    if not labels.size or (labels.min() >= 0 and labels.max() <= MAX_LABEL):
         return labels
-    if labels.min() < -1 or labels.max() >= SUPPORT_LABEL:
+    if labels.min() < -1 or labels.max() > MAX_LABEL:
         remedy = "number objects from 1, 0 or −1 = no object"
-        raise InputError(name, f"labels exceed 0…{SUPPORT_LABEL - 1}", remedy)
+        raise InputError(name, f"labels exceed 0…{MAX_LABEL}", remedy)
     return np.where(labels == -1, 0, labels)
 
 

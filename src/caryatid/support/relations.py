@@ -12,7 +12,7 @@ import numpy as np
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
-from caryatid.graph import DOUBTFUL, LIKELY, Kind, SceneObject, Support, SupportGraph
+from caryatid.graph import DOUBTFUL, LIKELY, Kind, SceneObject, Support, SupportGraph, vertex_order
 from caryatid.support.contacts import Contact, find_gap
 from caryatid.support.equilibrium import moved_without, support_forces, touching
 from caryatid.support.stability import assess
@@ -82,7 +82,7 @@ def infer(
     sampled from the uncertainty of shapes, friction and weights, in which it does.
 
     Args:
-        objects: Shapes in the world frame; nothing supports the one with role `support_surface`.
+        objects: Shapes in the world frame; nothing supports those with role `support_surface`.
         config: The stage's numbers.
         rng: Source of the draws; None draws the same ones every time.
 
@@ -120,7 +120,7 @@ def sort_objects(objects: Sequence[SceneObject]) -> tuple[SceneObject, ...]:
     """
     if len({o.id for o in objects}) < len(objects):
         raise InputError("objects", "two of them have the same id", "give each object a unique id")
-    return tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
+    return tuple(sorted(objects, key=vertex_order))
 
 
 def explain(graph: SupportGraph, supporter: str, supported: str, config: SupportConfig) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.geometry.transforms import Array
-from caryatid.sensing.views import SUPPORT_LABEL
+from caryatid.sensing.views import MAX_LABEL
 
 Colour = tuple[int, int, int]
 
@@ -47,7 +47,7 @@ def object_colour(label: int) -> str:
 
     After its last colour the palette begins again, darker.
     """
-    if label in (0, SUPPORT_LABEL):
+    if not 0 < label <= MAX_LABEL:
         return SURFACE_COLOUR
     turn, position = divmod(label - 1, len(PALETTE))
     return _css((1.0, 0.72, 0.5)[turn % 3] * np.array(rgb(PALETTE[position])))
@@ -55,7 +55,7 @@ def object_colour(label: int) -> str:
 
 def object_stripes(label: int) -> tuple[int, ...]:
     """Return the directions of the stripes on the object with this label, which tell like colours apart."""
-    if label in (0, SUPPORT_LABEL):
+    if not 0 < label <= MAX_LABEL:
         return ()
     return STRIPES[2 * (label - 1) // len(PALETTE) % len(STRIPES)]
 

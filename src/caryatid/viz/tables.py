@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from caryatid.geometry.shapes import Cylinder, Shape, Sphere
-from caryatid.graph import DOUBTFUL, Change, SceneObject, SupportGraph
+from caryatid.graph import DOUBTFUL, Change, SceneObject, SupportGraph, label_of
 from caryatid.viz.colours import object_colour, saliency_colour
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def order_table(order: Order, *, brief: bool = False) -> Table:
     rows = (
         (
             str(number),
-            Entry(step.object_id, object_colour(int(step.object_id[1:]))),
+            Entry(step.object_id, object_colour(label_of(step.object_id))),
             ", ".join(step.hold) or "–",
             Entry(f"{1.0 - step.risk:.2f}{'' if step.safe else ', too low'}", doubt=not step.safe),
             step.why,
