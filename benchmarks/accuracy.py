@@ -159,8 +159,9 @@ def extract(episode: Episode) -> list[Row]:
 def infer_exactly(name: str) -> list[Row]:
     """Infer supports from the true shapes of a built-in scene, on a table wider than the scene."""
     started, truth = time.perf_counter(), true_scene_from_simulation(load_scene(name))
-    table = Box(transforms.rigid(np.eye(3), (0.0, 0.0, truth.table_top - 0.02)), np.array([3.0, 3.0, 0.04]))
-    objects = [SceneObject(truth.table or "table", SUPPORT_LABEL, table, "support_surface")]
+    (surface, top), *_ = truth.surfaces.items()
+    table = Box(transforms.rigid(np.eye(3), (0.0, 0.0, top.height - 0.02)), np.array([3.0, 3.0, 0.04]))
+    objects = [SceneObject(surface, SUPPORT_LABEL, table, "support_surface")]
     objects += [SceneObject(o, k, shape) for k, (o, shape) in enumerate(truth.objects.items(), 1)]
     graph = infer(objects, Config().support)
     found = figures_of(score(graph, truth), graph, len(truth.objects))

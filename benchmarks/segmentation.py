@@ -65,7 +65,8 @@ class Segmentation(Gated, Simulated):
         opened = open_source(source, config, noise=self.noise, segmentation="labels", seed=self.seed)
         if opened.truth is None:
             raise CaryatidError(f"{source}: has no ground truth to score against")
-        sphere = ViewSphere.around(np.array([0.0, 0.0, opened.truth.table_top]), config.active)
+        top = next(iter(opened.truth.surfaces.values()))
+        sphere = ViewSphere.around(np.array([0.0, 0.0, top.height]), config.active)
         found = opened.robot.candidates(sphere)
         first = opened.robot.T_world_camera
         others = spread_out(found.directions, sphere.direction_of(first)[None], self.views - 1)

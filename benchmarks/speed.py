@@ -47,6 +47,7 @@ from caryatid.simulation.world import (
     Body,
     SimulatedScene,
     build_spec,
+    make_table,
     scene_from_spec,
     table_centre,
 )
@@ -126,7 +127,9 @@ def table_of(count: int, size: tuple[float, float] = (1.2, 1.2), pitch: float = 
     below = [_standing(xy, 0.0, rng, flat=k < stacked) for k, xy in enumerate(places)]
     above = [_standing(b.T_world_object[:2, 3], b.extents[2], rng) for b in below[:stacked]]
     name = f"table-of-{count}"
-    return scene_from_spec(build_spec([Body(s) for s in (*below, *above)], name, size), name, name)
+    return scene_from_spec(
+        build_spec([Body(s) for s in (*below, *above)], name, make_table(size)), name, name
+    )
 
 
 def _standing(xy: Array, height: float, rng: np.random.Generator, *, flat: bool = False) -> Shape:

@@ -212,7 +212,7 @@ WEIGHT = '<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ('name="table"', 'name="desk"', "has no body 'table'"),
+        ('name="table" pos="0', 'name="desk" pos="9', "nothing static carries an object"),
         ("<freejoint/>", "", "has no objects"),
         ("</mujoco>", "", "not an MJCF file"),
         (TWO_ON_A_TABLE, "a table with two cups", "not an MJCF file"),

@@ -13,11 +13,12 @@ from synthetic import box, sphere, table_object, thing
 from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.evaluation import as_scene, evaluate_run, score, score_masks
+from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry import transforms
-from caryatid.graph import Support, SupportGraph
+from caryatid.graph import SceneObject, Support, SupportGraph, object_id
 from caryatid.io import write_recording
 from caryatid.sensing.views import SUPPORT_LABEL, View
-from caryatid.simulation import load_scene, true_shapes
+from caryatid.simulation import ground_truth, load_scene, read_truth, true_shapes, write_truth
 from caryatid.steps import RunWriter
 
 
@@ -64,6 +65,32 @@ def test_the_table_is_found_within_two_centimetres(offset, found):
     result = score(tower(2, table=0.75 + offset), as_scene(tower(2)))
     assert ("o0" in result.matches) == found
     assert result.edge_recall == (1.0 if found else 0.5)
+
+
+def surface(label, centre, extents):
+    """A level surface, by the middle of its top."""
+    x, y, top = centre
+    return SceneObject(object_id(label), label, box((x, y, top - 0.005), (*extents, 0.01)), "support_surface")
+
+
+def test_support_surfaces_match_one_to_one_where_height_and_place_agree():
+    """A bin's floor 1.5 cm above its table is within the tolerance of both; the better overlap decides."""
+    table = surface(SUPPORT_LABEL, (0.0, 0.0, 0.75), (0.6, 0.9))
+    bin_floor = surface(SUPPORT_LABEL - 1, (0.0, 0.2, 0.765), (0.3, 0.4))
+    truth = as_scene(SupportGraph((table, bin_floor, thing(1, cube())), (Support("s1", "o1"),)))
+    swapped = (
+        surface(SUPPORT_LABEL, (0.01, 0.2, 0.76), (0.3, 0.4)),
+        surface(SUPPORT_LABEL - 1, (0.0, 0.0, 0.752), (0.5, 0.8)),
+    )
+    result = score(SupportGraph((*swapped, thing(1, cube())), (Support("o0", "o1"),)), truth)
+    assert result.matches == {"o0": "s1", "s1": "o0", "o1": "o1"}
+    assert result.f1 == 1.0
+    alone = score(SupportGraph((swapped[0],)), truth)
+    assert alone.matches == {"o0": "s1"}
+    assert alone.unfound == ("o0", "o1")
+    elsewhere = score(SupportGraph((table, surface(SUPPORT_LABEL - 1, (2.0, 0.0, 0.765), (0.3, 0.4)))), truth)
+    assert elsewhere.matches == {"o0": "o0"}
+    assert (elsewhere.vertex_precision, elsewhere.unfound) == (1 / 2, ("s1", "o1"))
 
 
 @pytest.mark.parametrize(("shift", "found"), [(0.030, True), (0.037, False)])
@@ -153,6 +180,21 @@ def test_a_run_is_scored_view_by_view_against_its_scene(tmp_path, scene_file):
     assert second.mean_iou > 0.98
     assert second.matches == {"o0": "table", "o1": "crate", "o2": "can"}
     assert evaluate_run(run, scene_file.parent) == (first, second)
+
+
+def test_the_surfaces_in_gt_json_count(tmp_path, scene_file):
+    scene = load_scene(scene_file)
+    assert true_scene_from_simulation(scene).surfaces["table"] == pytest.approx((0.7, 0.0, 0.0, 0.4, 0.5))
+    given, path = (
+        replace(ground_truth(scene), surfaces={"table": (0.72, 0.0, 0.1, 0.4, 0.5)}),
+        tmp_path / "gt.json",
+    )
+    write_truth(given, path)
+    assert read_truth(path) == given
+    assert true_scene_from_simulation(scene, read_truth(path)).surfaces["table"].height == 0.72
+    write_truth(replace(given, surfaces={"shelf": given.surfaces["table"]}), path)
+    with pytest.raises(InputError, match="'shelf', which is not a vertex"):
+        read_truth(path)
 
 
 def test_a_view_is_scored_by_the_pixels_of_its_frames_up_to_it(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +17,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Shape
 from caryatid.planning.candidates import Posture
+from caryatid.robots import view_sphere_of
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation import (
     SimulatedCamera,
@@ -35,7 +35,7 @@ from caryatid.simulation.camera import add_depth_noise, axial_sigma
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.scenes import DESIGNED, is_builtin
 from caryatid.simulation.setup import HumanoidBody, make_simulation
-from caryatid.simulation.world import bounds, poses_of, scene_from_spec, state_of
+from caryatid.simulation.world import bounds, poses_of, scene_from_spec, state_of, surface_of
 
 # Scenes
 
@@ -74,9 +74,10 @@ def write(path: Path, text: str) -> Path:
 
 
 def test_what_falls_off_or_does_not_come_to_rest_is_warned_of(tmp_path, caplog):
-    beside = '<body name="apple" pos="3 0 0.1"><freejoint/><geom type="sphere" size="0.03"/></body>'
+    beside = '<body name="apple" pos="0.5 0 0.8"><freejoint/><geom type="sphere" size="0.03"/></body>'
     high = mjcf(TABLE + CUBE.replace("0 0 0.78", "0 0 1.3"))
-    load_scene(write(tmp_path / "still.xml", mjcf(TABLE + CUBE)))
+    lying = '<body name="pear" pos="0.5 0 0.03"><freejoint/><geom type="sphere" size="0.03"/></body>'
+    load_scene(write(tmp_path / "still.xml", mjcf(TABLE + CUBE + lying)))
     load_scene(write(tmp_path / "high.xml", high), PhysicsConfig(settle_time=6.0))
     assert not caplog.messages
     load_scene(write(tmp_path / "fallen.xml", mjcf(TABLE + CUBE + beside)))
@@ -118,6 +119,57 @@ def test_volumes_of_shapes_in_their_bounds(geom: str, volume: float):
     distance = true_shapes(scene)[1].signed_distance
     assert (distance(points) < 0.0).mean() * np.prod(high - low) == pytest.approx(volume, rel=0.03)
     assert (distance(points + (high - low) * [1.0, 0.0, 0.0]) > 0.0).all()
+
+
+# Support surfaces
+
+
+FURNITURE = (
+    '<geom name="wall" type="box" size="0.01 1 1" pos="0.41 0 1"/>'
+    '<body name="board"><geom type="box" size="0.2 0.3 0.01" pos="0.2 0 0.49"/>'
+    '<geom type="box" size="0.02 0.02 0.24" pos="0.2 0 0.24"/></body>'
+)
+
+
+def cube(name: str, at: str) -> str:
+    body = f'<body name="{name}" pos="{at}"><freejoint/>'
+    return f'{body}<geom type="box" size="0.03 0.03 0.03" friction="0.6 0.005 0.0001"/></body>'
+
+
+def test_the_surface_that_most_objects_stand_on_is_the_main_one():
+    on_the_board = cube("low", "0.1 0 0.53") + cube("high", "0.1 0 0.59")
+    scene = scene_of(FURNITURE + cube("aside", "-1 2 0.03") + on_the_board)
+    assert scene.table == "board"
+    truth = ground_truth(scene)
+    assert truth.vertices == ("board", "floor", "aside", "low", "high")
+    assert truth.pairs == {("board", "low"), ("low", "high"), ("floor", "aside")}
+    assert surface_of(scene, "board") == pytest.approx((0.5, 0.2, 0.0, 0.2, 0.3))
+    assert surface_of(scene, "floor") == pytest.approx((0.0, 0.0, 0.0, 5.0, 5.0))
+
+
+def test_a_wall_on_which_an_object_leans_is_no_vertex():
+    plank = (
+        '<body name="plank" pos="0.36 0 0.66" euler="0 15 0"><freejoint/>'
+        '<geom type="box" size="0.01 0.05 0.16" friction="0.6 0.005 0.0001"/></body>'
+    )
+    assert ground_truth(scene_of(FURNITURE + plank)).vertices == ("board", "plank")
+
+
+@pytest.mark.parametrize("floor", ["", '<geom name="slab" type="box" size="4 4 0.1" pos="0 0 -0.09995"/>'])
+def test_the_robot_looks_at_objects_on_the_ground_and_does_not_drive_over_them(floor):
+    scene = scene_of(floor + cube("one", "1 2 0.031") + cube("other", "1.2 2.1 0.031"))
+    assert table_centre(scene) == pytest.approx((1.1, 2.05, 0.0), abs=1e-3)
+    made = make_simulation(scene, FEW_PIXELS, noise="none", seed=0)
+    candidates = made.robot.candidates(
+        view_sphere_of(made.robot, ViewSphere.around(table_centre(scene), FEW_PIXELS.active))
+    )
+    postures = [made.robot.solve(T) for T in candidates.T_world_camera]
+    places = np.array([p.platform_world[:2] for p in postures if isinstance(p, Posture)])
+    assert len(places) == len(postures) > 100
+    for label in scene.object_bodies:
+        corners = np.array(bounds(scene, label))[:, :2]
+        apart = np.maximum(corners[0] - places, places - corners[1]).clip(0.0)
+        assert np.hypot(*apart.T).min() >= RobotConfig().footprint
 
 
 # Built-in and generated scenes
@@ -203,8 +255,21 @@ def test_boards_over_an_edge_stand_only_with_their_weight(seed: int):
     assert lifting.lift(poses_of(scene), board + 1, LiftConfig()).disturbed[board]
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2, 4, 8, 11, 25])
+def test_storeys_carry_objects_on_every_level(seed: int):
+    scene = generate("storeys", 6, seed)
+    truth = ground_truth(scene)
+    assert scene.at_rest
+    assert len(scene.object_bodies) == 6
+    carrying = {name for name in truth.vertices if name in scene.surfaces}
+    furniture = set(scene.surfaces) - {"floor", "uprights", "case", "posts", "bin_walls"}
+    assert carrying - {"floor"} == furniture
+    assert {edge.supported for edge in truth.edges} == set(scene.object_bodies.values())
+    assert all(4.0 * np.prod(surface_of(scene, name)[3:]) >= 0.1 for name in carrying)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pile-6-2", "dense-11-4", "packed-5-1"])
+@pytest.mark.parametrize("name", ["pile-6-2", "dense-11-4", "packed-5-1", "storeys-5-1"])
 def test_generated_names_repeat_byte_for_byte(name: str):
     a, b = load_scene(name), load_scene(name)
     np.testing.assert_array_equal(a.data.qpos, b.data.qpos)
@@ -234,10 +299,12 @@ def test_built_in_scenes_are_listed_and_no_path_is_one():
 def test_physics_agrees_with_the_given_ground_truth():
     given, found, common = 0, 0, 0
     for path in sorted(SHARED.glob("*/gt.json")):
-        if "surfaces" in json.loads(path.read_text()):
-            continue  # Scenes with several surfaces: ground_truth knows one table.
-        reference, computed = read_truth(path), ground_truth(load_scene(path.parent))
-        assert computed.vertices == reference.vertices
+        scene = load_scene(path.parent)
+        reference, computed = read_truth(path), ground_truth(scene)
+        assert computed.vertices[0] == scene.table
+        assert {*computed.vertices} == {*reference.vertices}
+        for name, top in reference.surfaces.items():
+            assert surface_of(scene, name) == pytest.approx(top, abs=1e-5)
         given += len(reference.edges)
         found += len(computed.edges)
         common += len({*reference.edges} & {*computed.edges})

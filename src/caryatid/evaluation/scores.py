@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, fields
@@ -21,7 +20,25 @@ from caryatid.graph import SupportGraph
 from caryatid.sensing.views import SUPPORT_LABEL
 
 TABLE: Final = "table"
-"""Name of the support surface among the true vertices."""
+"""Name of the support surface among the true vertices of real frames."""
+
+
+class TrueSurface(NamedTuple):
+    """The top of a support surface.
+
+    Attributes:
+        height: Its height [m].
+        x: Of its middle [m].
+        y: Of its middle [m].
+        half_x: Half its size along x [m].
+        half_y: Half its size along y [m].
+    """
+
+    height: float
+    x: float
+    y: float
+    half_x: float
+    half_y: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -29,18 +46,17 @@ class TrueScene:
     """The ground truth: a support graph over shapes.
 
     Attributes:
-        vertices: Names, the table's too.
+        vertices: Names, those of the support surfaces too.
         edges: Directed pairs (supporter, supported) of names.
-        objects: Shape of each vertex that is an object; a vertex without one is never found.
-        table: Name of the vertex that is the support surface, or None.
-        table_top: Height of its top [m], NaN without a table.
+        objects: Shape of each vertex that is an object; a vertex that is neither this nor a surface is never
+            found.
+        surfaces: Top of each vertex that is a support surface, the main one first.
     """
 
     vertices: tuple[str, ...]
     edges: frozenset[tuple[str, str]]
     objects: Mapping[str, Shape]
-    table: str | None = None
-    table_top: float = math.nan
+    surfaces: Mapping[str, TrueSurface] = field(default_factory=dict)
 
 
 class Forecast(NamedTuple):
@@ -67,9 +83,9 @@ class Score:
         f1: Their harmonic mean [1].
         edge_precision: Edges alone [1].
         edge_recall: Edges alone [1].
-        vertex_precision: Vertices alone, the table included [1].
+        vertex_precision: Vertices alone, support surfaces included [1].
         vertex_recall: Vertices alone [1].
-        mean_iou: Mean IoU of the matched objects without the table; 0 if none is matched [1].
+        mean_iou: Mean IoU of the matched objects without surfaces; 0 if none is matched [1].
         brier: Brier score of the forecasts: their mean squared error; 0 is perfect, or without forecasts [1].
         average_precision: Area under precision over recall of the forecasts as the probability threshold
             falls from 1; 1 is perfect, or without forecasts [1].
@@ -126,13 +142,14 @@ def score(
     """Score a graph of fitted shapes against true ones.
 
     Every edge of the graph counts, doubtful ones too: a wrong guess costs precision. An edge is true if both
-    ends are matched and the directed pair is in the ground truth, whatever its kind.
+    ends are matched and the directed pair is in the ground truth, whatever its kind. Support surfaces match
+    one to one where their tops have the same height and overlap.
 
     Args:
         graph: The extracted graph, in the world frame of the truth.
         truth: The true scene.
         rng: Draws the points that measure volumes; None draws the same ones every time.
-        config: Minimum IoU, tolerance of the table's height, points per pair.
+        config: Minimum IoU, tolerance of the surfaces' heights, points per pair.
     """
     config = config or EvaluationConfig()
     rng = rng or np.random.default_rng(0)
@@ -149,9 +166,8 @@ def score(
             in_a, in_b = _inside(a, points_world), _inside(b, points_world)
             union = int(np.count_nonzero(in_a | in_b))
             iou[i, j] = np.count_nonzero(in_a & in_b) / union if union else 0.0
-    same = abs(_top_height(graph) - truth.table_top) <= config.table_tolerance
-    table = truth.table if same else None
-    return _matched(graph, truth.vertices, truth.edges, iou, list(truth.objects), table, config.min_iou)
+    surfaces = _match_surfaces(graph, truth, config.table_tolerance)
+    return _matched(graph, truth.vertices, truth.edges, iou, list(truth.objects), surfaces, config.min_iou)
 
 
 def score_masks(
@@ -184,8 +200,9 @@ def score_masks(
     # Other names than `object<obj_id>` are of no object, like the label 0.
     numbered = [re.fullmatch("object([0-9]+)", name) for name in names]
     iou = mask_ious(labels, true_labels, found, [int(n[1]) if n else 0 for n in numbered])
-    table = TABLE if TABLE in vertices else None
-    return _matched(graph, vertices, edges, iou, names, table, config.min_iou)
+    main = graph.support_surface
+    surfaces = {main.id: TABLE} if main is not None and TABLE in vertices else {}
+    return _matched(graph, vertices, edges, iou, names, surfaces, config.min_iou)
 
 
 def _matched(
@@ -194,16 +211,17 @@ def _matched(
     edges: Set[tuple[str, str]],
     iou: Array,
     names: Sequence[str],
-    table: str | None,
+    surfaces: Mapping[str, str],
     min_iou: float,
 ) -> Score:
-    """Match the graph's objects (F) one to one with those of these names (T) by IoUs (F, T), and score."""
+    """Match the graph's objects (F) one to one with those of these names (T) by IoUs (F, T), and score.
+
+    The true name of each matched support surface is given by its id.
+    """
     objects = [o.id for o in graph.objects if o.role == "object"]
     pairs = assign(iou, min_iou)
-    matches = {objects[i]: names[j] for i, j in pairs}
+    matches = {objects[i]: names[j] for i, j in pairs} | dict(surfaces)
     ious = {objects[i]: float(iou[i, j]) for i, j in pairs}
-    if graph.support_surface is not None and table is not None:
-        matches[graph.support_surface.id] = table
     found = {(matches.get(s.supporter, ""), matches.get(s.supported, "")): s for s in graph.supports}
     judged = {pair: Forecast(s.belief, pair in edges) for pair, s in found.items() if all(pair)}
     v, e = len(matches), sum(forecast.true for forecast in judged.values())
@@ -290,25 +308,43 @@ def assign(iou: Array, min_iou: float) -> list[tuple[int, int]]:
 
 def as_scene(graph: SupportGraph) -> TrueScene:
     """Take a graph of fitted shapes as the truth, with vertices named by their ids."""
-    surface = graph.support_surface
     return TrueScene(
         vertices=tuple(o.id for o in graph.objects),
         edges=frozenset(s.pair for s in graph.supports),
         objects={o.id: o.shape for o in graph.objects if o.role == "object"},
-        table=None if surface is None else surface.id,
-        table_top=_top_height(graph),
+        surfaces={o.id: _top_of(o.shape) for o in graph.support_surfaces},
     )
 
 
-def _top_height(graph: SupportGraph) -> float:
-    """Height [m] of the middle of the support surface's top; of a box, of its most level upper face."""
-    if graph.support_surface is None:
-        return math.nan
-    shape = graph.support_surface.shape
-    height, rise = shape.T_world_object[2, 3], np.abs(shape.T_world_object[2, :3])
+def _match_surfaces(graph: SupportGraph, truth: TrueScene, tolerance: float) -> dict[str, str]:
+    """True surface of each support surface of a graph, one to one, with the largest overlap of tops (IoU)."""
+    found = {o.id: _top_of(o.shape) for o in graph.support_surfaces}
+    # A bin's floor may lie within the tolerance above its table: the better overlap decides.
+    overlap = np.zeros((len(found), len(truth.surfaces)))
+    for i, a in enumerate(found.values()):
+        for j, b in enumerate(truth.surfaces.values()):
+            overlap[i, j] = _top_overlap(a, b) if abs(a.height - b.height) <= tolerance else 0.0
+    names, true = list(found), list(truth.surfaces)
+    return {names[i]: true[j] for i, j in assign(overlap, 0.0) if overlap[i, j] > 0.0}
+
+
+def _top_of(shape: Shape) -> TrueSurface:
+    """Top of a surface's shape: height of the middle, of a box of its most level upper face; its bounds."""
+    rise = np.abs(shape.T_world_object[2, :3])
+    x, y, height = shape.T_world_object[:3, 3].tolist()
+    half_x, half_y, up = shape.support(np.eye(3)).tolist()
     if isinstance(shape, Box):
-        return float(height + rise.max() * shape.extents[np.argmax(rise)] / 2.0)
-    return float(height + shape.support(np.array([[0.0, 0.0, 1.0]]))[0])
+        up = float(rise.max() * shape.extents[np.argmax(rise)] / 2.0)
+    return TrueSurface(height + up, x, y, half_x, half_y)
+
+
+def _top_overlap(a: TrueSurface, b: TrueSurface) -> float:
+    """IoU of two tops, seen from above [1]."""
+    low = max(a.x - a.half_x, b.x - b.half_x), max(a.y - a.half_y, b.y - b.half_y)
+    high = min(a.x + a.half_x, b.x + b.half_x), min(a.y + a.half_y, b.y + b.half_y)
+    common = max(high[0] - low[0], 0.0) * max(high[1] - low[1], 0.0)
+    areas = 4.0 * (a.half_x * a.half_y + b.half_x * b.half_y)
+    return common / (areas - common) if common else 0.0
 
 
 def _ratios(right: int, claimed: int, true: int) -> tuple[float, float]:

@@ -10,20 +10,20 @@ import numpy as np
 
 from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
-from caryatid.evaluation.scores import Score, TrueScene, score, score_masks
+from caryatid.evaluation.scores import Score, TrueScene, TrueSurface, score, score_masks
 from caryatid.io.bop import read_recording
 from caryatid.io.datasets import find_sample
 from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, load_scene
 from caryatid.simulation.truth import GroundTruth, ground_truth, read_truth
-from caryatid.simulation.world import SimulatedScene, posed, table_centre, true_shapes
+from caryatid.simulation.world import SimulatedScene, posed, surface_of, true_shapes
 from caryatid.steps import Run, read_run
 
 log = logging.getLogger(__name__)
 
 
 def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None = None) -> TrueScene:
-    """Build the truth of a simulated scene: its shapes, and edges from gt.json.
+    """Build the truth of a simulated scene: its shapes and surfaces, and edges from gt.json.
 
     Args:
         scene: The scene.
@@ -37,14 +37,19 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
         file = Path(scene.source).parent / TRUTH_FILE
         known = file.is_file() and not is_builtin(scene.source)
         truth = read_truth(file) if known else ground_truth(scene)
-    labels = {scene.table: 0} | {body: label for label, body in scene.object_bodies.items()}
-    if strange := [name for name in truth.vertices if name not in labels]:
+    labels = {body: label for label, body in scene.object_bodies.items()}
+    known_names = [*scene.surfaces, *labels]
+    if strange := [name for name in truth.vertices if name not in known_names]:
         why = f"gt.json names '{strange[0]}', which is not a body of the scene"
-        raise InputError(scene.source, why, f"known bodies: {', '.join(labels)}")
+        raise InputError(scene.source, why, f"known bodies: {', '.join(known_names)}")
     shapes = true_shapes(scene)
-    objects = {name: shapes[labels[name]] for name in truth.vertices if name != scene.table}
-    table = scene.table if scene.table in truth.vertices else None
-    return TrueScene(truth.vertices, frozenset(truth.pairs), objects, table, float(table_centre(scene)[2]))
+    objects = {name: shapes[labels[name]] for name in truth.vertices if name in labels}
+    surfaces = {
+        name: TrueSurface(*(truth.surfaces.get(name) or surface_of(scene, name)))
+        for name in scene.surfaces
+        if name in truth.vertices
+    }
+    return TrueScene(truth.vertices, frozenset(truth.pairs), objects, surfaces)
 
 
 def evaluate_run(
@@ -59,7 +64,7 @@ def evaluate_run(
         run_folder: The folder of a run, or the run as read.
         truth: A built-in scene; an MJCF file or scene folder, with `gt.json` beside it or else compared with
             physics; or a recording with masks and `gt.json`. None = the run's own source.
-        config: Minimum IoU, tolerance of the table's height, points per pair.
+        config: Minimum IoU, tolerance of the surfaces' heights, points per pair.
 
     Raises:
         InputError: The run or the truth is missing or broken, or they do not fit each other.

@@ -165,8 +165,8 @@ def bodies_of(graph: SupportGraph, truth: TrueScene) -> dict[str, str]:
     It is the one it overlaps most; an object with an overlap below 0.01 (IoU) represents none.
     """
     found = score(graph, truth, np.random.default_rng(0), replace(EvaluationConfig(), min_iou=0.01))
-    table = graph.support_surface
-    return {i: body for i, body in found.matches.items() if table is None or i != table.id}
+    surfaces = {o.id for o in graph.support_surfaces}
+    return {i: body for i, body in found.matches.items() if i not in surfaces}
 
 
 class SimulatedHands:

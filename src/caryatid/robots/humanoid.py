@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +27,9 @@ REASONS = (
 )
 """Reasons to reject a view; the first that applies counts."""
 
+FARTHEST = 2.0
+"""Radius of the view sphere up to which the robot steps back from a low surface [m]: depth gets noisy."""
+
 Indices = NDArray[np.intp]
 """Whole numbers (N,)."""
 
@@ -41,6 +46,20 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
         self._paths: FloorPaths | None = None
         self._reached = floor.free.ravel()
         self._offer: tuple[ViewSphere, NDArray[np.bool_], Candidates, Array] | None = None
+        self._spheres: tuple[ViewSphere, ViewSphere] | None = None
+
+    def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
+        """Look at a low surface, such as the floor, from farther off, where the head need not pitch too far.
+
+        At its steepest pitch the camera then has the middle of its heights.
+        """
+        if self._spheres is None or self._spheres[0] is not proposed:
+            rise = float(np.mean(self._config.camera_height)) - proposed.centre_world[2]
+            steepest = np.sin(np.deg2rad(-self._config.pitch[0]))
+            radius = min(rise / max(float(steepest), 1e-9), FARTHEST)
+            own = proposed if radius <= proposed.radius else replace(proposed, radius=radius)
+            self._spheres = proposed, own
+        return self._spheres[1]
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
         """Return the robot's posture with its camera at a pose (4, 4), or why there is none."""

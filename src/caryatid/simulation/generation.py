@@ -1,4 +1,4 @@
-"""Random scenes: piles, heaps, packed and household objects, blocks, boards and overhanging boards."""
+"""Random scenes: piles, heaps, packed and household objects, blocks, boards, overhangs, and storeys."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sph
 from caryatid.geometry.solids import Polytope, Solid, hollowed
 from caryatid.geometry.transforms import UP, Array
 from caryatid.simulation import world
-from caryatid.simulation.world import TABLE_HEIGHT, TABLE_SIZE, Body, Side, SimulatedScene
+from caryatid.simulation.world import FRAME, TABLE_HEIGHT, TABLE_SIZE, Body, Part, Side, SimulatedScene
 
-GeneratedKind = Literal["pile", "dense", "packed", "house", "blocks", "boards", "overhang"]
+GeneratedKind = Literal["pile", "dense", "packed", "house", "blocks", "boards", "overhang", "storeys"]
 SIZES: dict[GeneratedKind, tuple[int, int]] = {
     "pile": (1, 25), "dense": (10, 25), "packed": (2, 25), "house": (1, 14), "blocks": (2, 10),
-    "boards": (4, 12), "overhang": (4, 12),
+    "boards": (4, 12), "overhang": (4, 12), "storeys": (4, 8),
 }  # fmt: skip
 """Kind of a scene → minimum and maximum number of objects, including the screens of a dense one."""
 GAP = 0.002
@@ -39,12 +39,16 @@ _Drop = tuple[Body, bool]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Plan:
-    """Setup of a scene: function that draws each object, what stands first, size of the table [m], walls."""
+    """Setup of a scene: function that draws each object, what stands first, size of the table [m], walls.
+
+    With other furniture instead of the table, objects stay where they are put.
+    """
 
     draw: Callable[[SimulatedScene | None], _Drop]
     screens: tuple[Body, ...] = ()
     table: tuple[float, float] = TABLE_SIZE
     walls: tuple[Side, ...] = ()
+    furniture: Sequence[Part] | None = None
 
 
 def generate(
@@ -57,7 +61,9 @@ def generate(
     primitives. `house` has trays, bowls, mugs, plates, books and the like on and in each other. `blocks` are
     equal boxes in a row, a wall or a pyramid, with gaps of 0 to 15 mm. `boards` has a board, plank or tray on
     two pillars, with loads on it and lower objects under it. `overhang` has boards over the edge of the table
-    or of a block, each held down by a weight, and other objects around them.
+    or of a block, each held down by a weight, and other objects around them. `storeys` has primitives, some
+    stacked, on the levels of one of eight kinds of furniture: a low table and the floor, a side table, the
+    bare floor, a table with a step, a shelf, a cart, a bin on a table, or two tables.
 
     Args:
         kind: Kind of scene.
@@ -83,6 +89,7 @@ def generate(
         "blocks": _blocks,
         "boards": _boards,
         "overhang": _overhang,
+        "storeys": _storeys,
     }
     return _set_down(name, size, plans[kind](rng, size), physics or PhysicsConfig())
 
@@ -240,6 +247,157 @@ def _overhang(rng: np.random.Generator, size: int) -> _Plan:
     return _Plan(draw, tuple(bodies))
 
 
+Rectangle = tuple[float, float, float, float]
+"""Middle and size of a level rectangle, each along x and y [m]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Level:
+    """A level of furniture: height of its top, its outline, height of what is above it [m]."""
+
+    height: float
+    outline: Rectangle
+    ceiling: float = np.inf
+
+    @property
+    def middle(self) -> Array:
+        """Middle (2,) [m]."""
+        return np.array(self.outline[:2])
+
+    def carries(self, shape: Shape) -> bool:
+        """Whether the middle of a shape is over the level."""
+        x, y, z = shape.T_world_object[:3, 3]
+        inside = (np.abs(self.middle - (x, y)) < np.array(self.outline[2:]) / 2.0).all()
+        return bool(inside) and self.height < z < self.ceiling
+
+
+def _storeys(rng: np.random.Generator, size: int) -> _Plan:
+    """An object on each level first; three in ten of the others on another one."""
+    kinds = (_low_table, _side_table, _ground, _step, _shelf, _cart, _bin, _two_tables)
+    furniture, levels = kinds[int(rng.integers(len(kinds)))](rng)
+
+    def draw(scene: SimulatedScene | None) -> _Drop:
+        others = [] if scene is None else list(world.true_shapes(scene).values())
+        for _ in range(TRIES + 1):
+            level = levels[len(others) if len(others) < len(levels) else int(rng.integers(len(levels)))]
+            shape, below = _upright(rng), [other for other in others if level.carries(other)]
+            if below and rng.random() < 0.3:
+                other = below[int(rng.integers(len(below)))]
+                reach = 0.3 * other.support(np.eye(3))[:2]
+                xy = other.T_world_object[:2, 3] + reach * rng.uniform(-1.0, 1.0, size=2)
+            else:
+                half = np.array(level.outline[2:]) / 2.0 - 0.06
+                xy = level.middle + rng.uniform(-half, half)
+            solid = _let_go(shape, xy, scene, level.height, level.ceiling)
+            if not any(_meets(solid.shape, part) for part in furniture):
+                break
+        return solid, False
+
+    return _Plan(draw, furniture=furniture)
+
+
+def _meets(shape: Shape, part: Part) -> bool:
+    """Whether the level box around a shape, a centimetre wider and higher, overlaps a part."""
+    apart = shape.T_world_object[:3, 3] + (0.0, 0.0, 0.005) - part.centre
+    return bool((np.abs(apart) < shape.support(np.eye(3)) + (0.01, 0.01, 0.005) + part.half).all())
+
+
+def _board(body: str, outline: Rectangle, top: float, thick: float = 0.02) -> Part:
+    """A level board by the height of its top [m]."""
+    x, y, depth, width = outline
+    return Part(body, np.array([x, y, top - thick / 2.0]), np.array([depth, width, thick]) / 2.0)
+
+
+def _upright_board(body: str, outline: Rectangle, bottom: float, top: float) -> Part:
+    """A post or an upright board from one height to another [m]."""
+    x, y, depth, width = outline
+    return Part(
+        body, np.array([x, y, (bottom + top) / 2.0]), np.array([depth, width, top - bottom]) / 2.0, FRAME
+    )
+
+
+_Furniture = tuple[list[Part], list[_Level]]
+
+
+def _low_table(rng: np.random.Generator) -> _Furniture:
+    """A low table, and objects on the floor along one side of it."""
+    depth, width, height = rng.uniform((0.5, 0.7, 0.32), (0.65, 1.0, 0.48))
+    side, (away, other) = rng.integers(4), rng.uniform((0.25, -0.2), (0.35, 0.2))
+    x, y = [(depth / 2.0 + away, other), (other, width / 2.0 + away)][side % 2]
+    x, y = (x, y) if side < 2 else (-x, -y)
+    floor = _Level(0.0, (x, y, 0.4, 0.4))
+    return world.make_table((depth, width), height=height), [_Level(height, (0.0, 0.0, depth, width)), floor]
+
+
+def _side_table(rng: np.random.Generator) -> _Furniture:
+    """A small table."""
+    side, height = rng.uniform((0.38, 0.45), (0.48, 0.6))
+    return world.make_table((side, side), height=height), [_Level(height, (0.0, 0.0, side, side))]
+
+
+def _ground(rng: np.random.Generator) -> _Furniture:
+    """The bare floor."""
+    return [], [_Level(0.0, (0.0, 0.0, *rng.uniform(0.5, 0.8, size=2)))]
+
+
+def _step(rng: np.random.Generator) -> _Furniture:
+    """A board on two uprights, on the far half of a table."""
+    depth, width, up = rng.uniform((0.26, 0.4, 0.16), (0.3, 0.44, 0.25))
+    x, y = TABLE_SIZE[0] / 2.0 - depth / 2.0 - 0.01, rng.choice([-1.0, 1.0]) * rng.uniform(0.0, 0.2)
+    top, under = TABLE_HEIGHT + up, TABLE_HEIGHT + up - 0.02
+    ends = [(x, y + sign * (width / 2.0 - 0.02), depth, 0.016) for sign in (-1, 1)]
+    uprights = [_upright_board("uprights", end, TABLE_HEIGHT, under) for end in ends]
+    parts = [*world.make_table(), _board("step", (x, y, depth, width), top), *uprights]
+    return parts, [_Level(TABLE_HEIGHT, (0.0, 0.0, *TABLE_SIZE)), _Level(top, (x, y, depth, width))]
+
+
+def _shelf(rng: np.random.Generator) -> _Furniture:
+    """Two or three boards in a case that is open to the robot."""
+    depth, width, lowest, apart = rng.uniform((0.28, 0.7, 0.45, 0.32), (0.36, 0.9, 0.65, 0.42))
+    tops = lowest + apart * np.arange(rng.integers(2, 4))
+    outline, back, side = (0.1, 0.0, depth, width), 0.11 + depth / 2.0, 0.01 + width / 2.0
+    walls = [(back, 0.0, 0.02, width + 0.04), *((0.1, y, depth, 0.02) for y in (-side, side))]
+    case = [_upright_board("case", wall, 0.0, tops[-1] + 0.05) for wall in walls]
+    boards = [_board(f"board{k}", outline, top) for k, top in enumerate(tops)]
+    ceilings = [*(tops[1:] - 0.02), np.inf]
+    return boards + case, [_Level(a, outline, b) for a, b in zip(tops, ceilings, strict=True)]
+
+
+def _cart(rng: np.random.Generator) -> _Furniture:
+    """Two boards between four posts."""
+    depth, width, low, high = rng.uniform((0.4, 0.6, 0.25, 0.75), (0.5, 0.75, 0.35, 0.85))
+    outline = (0.0, 0.0, depth, width)
+    corners = [(a * (depth / 2 - 0.015), b * (width / 2 - 0.015)) for a in (-1, 1) for b in (-1, 1)]
+    posts = [_upright_board("posts", (x, y, 0.024, 0.024), 0.0, high - 0.02) for x, y in corners]
+    boards = [_board("cart_low", outline, low), _board("cart_high", outline, high)]
+    return boards + posts, [_Level(high, outline), _Level(low, outline, high - 0.02)]
+
+
+def _bin(rng: np.random.Generator) -> _Furniture:
+    """An open bin on one half of a table, and objects on the other half too."""
+    depth, width, wall = rng.uniform((0.28, 0.36, 0.08), (0.36, 0.42, 0.12))
+    y = rng.choice([-1.0, 1.0]) * (TABLE_SIZE[1] / 4.0 - 0.01)
+    outline, top, rim = (0.0, y, depth, width), TABLE_HEIGHT + 0.015, TABLE_HEIGHT + wall
+    x_wall, y_wall = depth / 2.0 + 0.006, width / 2.0 + 0.006
+    walls = [(s * x_wall, y, 0.012, width + 0.024) for s in (-1, 1)]
+    walls += [(0.0, y + s * y_wall, depth, 0.012) for s in (-1, 1)]
+    parts = [*world.make_table(), _board("bin", outline, top, 0.015)]
+    parts += [_upright_board("bin_walls", side, TABLE_HEIGHT, rim) for side in walls]
+    free = (0.0, -y, TABLE_SIZE[0], TABLE_SIZE[1] / 2.0 - 0.02)
+    return parts, [_Level(TABLE_HEIGHT, free), _Level(top, outline)]
+
+
+def _two_tables(rng: np.random.Generator) -> _Furniture:
+    """A table of the usual height, and a lower one beside it."""
+    parts, levels = list[Part](), []
+    for name, side, height in ((world.TABLE, -1, TABLE_HEIGHT), ("table2", 1, rng.uniform(0.45, 0.62))):
+        depth, width, gap = rng.uniform((0.45, 0.45, 0.02), (0.6, 0.55, 0.05))
+        at = 0.0, side * (width / 2.0 + gap)
+        parts += world.make_table((depth, width), height=height, at=at, name=name)
+        levels.append(_Level(height, (*at, depth, width)))
+    return parts, levels
+
+
 def _stacked(
     rng: np.random.Generator, size: int, make: Callable[[np.random.Generator], Shape], margin: float
 ) -> _Plan:
@@ -258,12 +416,13 @@ def _stacked(
 def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> SimulatedScene:
     """Drop solids one after the other, each when all are at rest; failures are tried again.
 
-    Screens must not be upset; without screens, no earlier object. If nothing can be set down, the last solid
-    is removed again too; after 40 drops per object the scene fails.
+    Screens must not be upset; without screens, no earlier object; on other furniture than a table, none. If
+    nothing can be set down, the last solid is removed again too; after 40 drops per object the scene fails.
     """
 
     def build(solids: Sequence[Body], config: PhysicsConfig = physics, least: float = 0.0) -> SimulatedScene:
-        spec = world.build_spec(solids, name, plan.table, plan.walls)
+        table = world.make_table(plan.table, plan.walls)
+        spec = world.build_spec(solids, name, table if plan.furniture is None else plan.furniture)
         return world.scene_from_spec(spec, name, name, config, least=least)
 
     # An object that has not come to rest after two seconds is set down again.
@@ -278,7 +437,8 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
         tried = build([*solids, solid], impatient, least=0.3)
         on_the_table = world.bounds(tried, len(solids) + 1)[0][2] <= TABLE_HEIGHT + GAP
         slipped = stacked and failures < TRIES // 2 and on_the_table
-        if not slipped and _stands(tried, solids[:fixed] or solids, plan, physics):
+        firm = [*solids, solid] if plan.furniture is not None else solids[:fixed] or solids
+        if not slipped and _stands(tried, firm, plan, physics):
             shapes = world.true_shapes(tried).values()
             solids = [replace(s, shape=shape) for s, shape in zip([*solids, solid], shapes, strict=True)]
             below, failures = tried, 0
@@ -287,7 +447,7 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
         if failures == TRIES and len(solids) > fixed:
             solids, failures = solids[:-1], 0
             below = build(solids) if solids else None
-    raise InputError(name, f"object{len(solids)} would not stay on the table", "choose another seed")
+    raise InputError(name, f"object{len(solids)} would not stay where it was put", "choose another seed")
 
 
 def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: PhysicsConfig) -> bool:
@@ -295,11 +455,11 @@ def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: P
 
     An object whose middle is within a centimetre of the table's edge counts as fallen, unless it stood there
     first; none may reach higher than 36 cm above the table. Setting down another one may shift the firm ones
-    by up to 4 cm.
+    by up to 4 cm. On other furniture than a table, the latter suffices.
     """
     shapes = world.true_shapes(scene)
     half = np.array(plan.table) / 2.0 - 0.01
-    for label, shape in shapes.items():
+    for label, shape in shapes.items() if plan.furniture is None else ():
         low, high = world.bounds(scene, label)
         if low[2] < TABLE_HEIGHT - GAP or high[2] > TABLE_HEIGHT + 0.36:
             return False
@@ -318,13 +478,23 @@ def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: P
     return not world.strayed(world.body_poses(scene.data), world.body_poses(data), *limits).any()
 
 
-def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Body:
-    """Put a shape from the origin just above the boxes around the objects at a place (2,) [m]."""
+def _let_go(
+    shape: Shape,
+    xy: Array,
+    scene: SimulatedScene | None,
+    height: float = TABLE_HEIGHT,
+    ceiling: float = np.inf,
+) -> Body:
+    """Put a shape from the origin just above the boxes around the objects at a place (2,) [m].
+
+    Only objects between two heights [m] count, the lower of which is the support's.
+    """
     over = shape.moved(transforms.rigid(np.eye(3), (*xy, 0.0)))
-    tops = [TABLE_HEIGHT]
+    tops = [height]
     if scene is not None:
         others = world.true_shapes(scene).items()
-        tops += [float(world.bounds(scene, label)[1][2]) for label, other in others if _overlap(over, other)]
+        below = [k for k, s in others if height < s.T_world_object[2, 3] < ceiling and _overlap(over, s)]
+        tops += [float(world.bounds(scene, label)[1][2]) for label in below]
     z = max(tops) + float(shape.support(np.array([[0.0, 0.0, -1.0]]))[0]) + GAP
     return Body(over.moved(transforms.rigid(np.eye(3), (0.0, 0.0, z))))
 

@@ -95,6 +95,7 @@ DESCRIPTIONS: Final[Mapping[str, str]] = {
     "blocks": "equal boxes in a row, a wall or a pyramid",
     "boards": "a board, plank or tray on two pillars, over other objects",
     "overhang": "boards over the edge of the table or of a block, held down by weights, and other objects",
+    "storeys": "primitives on several levels: floor and low table, step, shelf, cart, bin, two tables",
 }
 """Descriptions of the designed scenes and of the generated kinds."""
 
@@ -124,7 +125,7 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
         config: When a scene is at rest.
 
     Raises:
-        InputError: No such file or scene, broken XML, no static body `table`, no objects, or it is unstable.
+        InputError: No such file or scene, broken XML, no objects, nothing carries them, or it is unstable.
     """
     text = fspath(source)
     if text in DESIGNED:  # give the solids a second to find their contacts
@@ -154,8 +155,11 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
     scene = world.scene_from_spec(spec, name or path.stem, str(path), config)
     top, bodies = world.table_centre(scene)[2], scene.object_bodies
-    if fallen := [bodies[label] for label in bodies if world.bounds(scene, label)[1][2] < top]:
-        log.warning("%s: %s fell off the table before the first view", path, ", ".join(fallen))
+    started = scene.model.qpos0[world.pose_addresses(scene)][:, 2]
+    below = [world.bounds(scene, label)[1][2] < top for label in bodies]
+    fallen = [name for name, z, low in zip(bodies.values(), started, below, strict=True) if low and z > top]
+    if fallen:
+        log.warning("%s: %s fell off the %s before the first view", path, ", ".join(fallen), scene.table)
     if not scene.at_rest:
         log.warning("%s: the scene still moves; its ground truth may change between views", path)
     return scene

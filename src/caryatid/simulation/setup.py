@@ -8,14 +8,16 @@ import mujoco
 import numpy as np
 
 from caryatid.config import Config, NoiseModel, RobotConfig
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Posture
 from caryatid.robots import HUMANOID, Robot, RobotMaker, Surroundings, find_robot, go_home
-from caryatid.robots.floor import FloorGrid
+from caryatid.robots.floor import STEP, FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.simulation.world import SimulatedScene, static_boxes, table_centre
+from caryatid.simulation.world import SimulatedScene, bounds, static_boxes, table_centre
 
 PLATFORM, MAST, NECK = 0.3, 0.04, 0.15
 """Maximum height of the platform, radius of its mast, and distance from the mast's end to the camera [m]."""
@@ -84,19 +86,27 @@ class Simulation:
 def make_simulation(
     scene: SimulatedScene, config: Config, *, noise: NoiseModel, seed: int, robot: RobotMaker | str = HUMANOID
 ) -> Simulation:
-    """Put a robot at its home view in front of the table, with the furniture on its floor map.
+    """Put a robot at its home view in front of the main surface.
 
-    The robot is a maker, or a name for `find_robot`; the seed is that of the camera's noise.
+    Its floor map has the furniture, which also blocks views, and the objects on the ground. The robot is a
+    maker, or a name for `find_robot`; the seed is that of the camera's noise.
 
     Raises:
         InputError: There is no robot of this name.
-        PlanningError: No view of the table can be reached.
+        PlanningError: No view of the surface can be reached.
     """
-    centre = table_centre(scene)
-    floor = FloorGrid.from_boxes(static_boxes(scene), config.robot, centre[:2])
+    centre, furniture = table_centre(scene), static_boxes(scene)
+    around = [bounds(scene, label) for label in scene.object_bodies]
+    lying = [
+        Box(transforms.rigid(np.eye(3), (low + high) / 2.0), high - low)
+        for low, high in around
+        if low[2] <= STEP
+    ]
+    floor = FloorGrid.from_boxes([*furniture, *lying], config.robot, centre[:2])
+    floor = replace(floor, furniture=furniture)
     make = find_robot(robot) if isinstance(robot, str) else robot
     made = make(Surroundings(centre, floor, config))
     go_home(made, ViewSphere.around(centre, config.active), config.robot)
-    around = HumanoidBody(scene, made, config.robot).around if isinstance(made, HumanoidRobot) else None
-    camera = SimulatedCamera(scene, noise, config.noise, np.random.default_rng(seed), config.sensor, around)
+    body = HumanoidBody(scene, made, config.robot).around if isinstance(made, HumanoidRobot) else None
+    camera = SimulatedCamera(scene, noise, config.noise, np.random.default_rng(seed), config.sensor, body)
     return Simulation(camera, made)

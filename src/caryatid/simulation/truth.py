@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
@@ -10,12 +11,18 @@ import numpy as np
 
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
-from caryatid.geometry.transforms import Array
 from caryatid.graph import Kind
 from caryatid.io.json_files import json_text, parse_json, read_json
 from caryatid.io.staging import write_file
 from caryatid.runtime.parallel import on_threads
-from caryatid.simulation.world import SimulatedScene, body_poses, state_of, strayed
+from caryatid.simulation.world import (
+    SimulatedScene,
+    body_poses,
+    held_from_below,
+    mean_contact_forces,
+    state_of,
+    strayed,
+)
 
 _REMEDY = 'write {"vertices": […], "edges": [{"supporter", "supported", "kind"}, …]}'
 
@@ -40,12 +47,15 @@ class GroundTruth:
     """Content of gt.json.
 
     Attributes:
-        vertices: Names of the bodies, the table first.
+        vertices: Names of the support surfaces, the main one first, and then of the objects.
         edges: Supports, sorted by supporter and then supported, in the order of the vertices.
+        surfaces: Height, x and y of the middle, and half sizes along x and y of the top of support surfaces
+            by name [m]; those that it lacks are as in the scene.
     """
 
     vertices: tuple[str, ...]
     edges: tuple[TrueEdge, ...]
+    surfaces: Mapping[str, tuple[float, float, float, float, float]] = field(default_factory=dict)
 
     @property
     def pairs(self) -> set[tuple[str, str]]:
@@ -56,20 +66,20 @@ class GroundTruth:
 def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> GroundTruth:
     """Derive the support graph from the physics of a settled scene, whose state does not change.
 
-    A supports B `bottom-up` if the upward part of the mean contact force of A on B exceeds 3 % of B's weight.
+    The vertices are the main surface, everything else static that carries an object, and the objects. A
+    supports B `bottom-up` if the upward part of the mean contact force of A on B exceeds 3 % of B's weight.
     Each object A is then removed for a second. A also supports an object B in contact with it that moves by
     more than 1 cm or 8° without it: `top-down` if A presses on B, `lean` if the force between them is mostly
     horizontal.
     """
     config = config or PhysicsConfig()
-    names = {0: scene.table, **scene.object_bodies}
     forces = mean_contact_forces(scene)
-    gravity = np.linalg.norm(scene.model.opt.gravity)
-    weights = {a: scene.model.body_subtreemass[scene.body_id(a)] * gravity for a in names}
-    share = config.force_share
-    held = {(a, b) for (a, b), force in forces.items() if b != 0 and force[2] > share * weights[b]}
+    held = held_from_below(scene, forces, config.force_share)
+    carrying = {0} | {a for a, _ in held}
+    surfaces = {-k: name for k, name in enumerate(scene.surfaces) if -k in carrying}
+    names = {**surfaces, **scene.object_bodies}
     kinds: dict[tuple[int, int], Kind] = dict.fromkeys(held, "bottom-up")
-    others = [(a, b) for a, b in forces if a != 0 != b and (a, b) not in held]
+    others = [(a, b) for a, b in forces if a > 0 < b and (a, b) not in held]
     labels = sorted({a for a, _ in others})
     moved = on_threads(lambda k: displaced_without(scene, labels[k], config), len(labels))
     falling = dict(zip(labels, moved, strict=True))
@@ -79,32 +89,10 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
             force = forces[a, b]
             steep = -force[2] > np.sin(np.deg2rad(30.0)) * np.linalg.norm(force)
             kinds[a, b] = "top-down" if steep else "lean"
-    edges = [TrueEdge(names[a], names[b], kinds[a, b]) for a, b in sorted(kinds)]
+    rank = {label: place for place, label in enumerate(names)}
+    order = sorted(kinds, key=lambda pair: (rank[pair[0]], rank[pair[1]]))
+    edges = [TrueEdge(names[a], names[b], kinds[a, b]) for a, b in order]
     return GroundTruth(tuple(names.values()), tuple(edges))
-
-
-def mean_contact_forces(scene: SimulatedScene) -> dict[tuple[int, int], Array]:
-    """Mean force (3,) [N] of A on B over a fifth of a second, by the labels of each pair that touches.
-
-    Soft contacts creep, so longer means would drift. Label 0 is the table; contacts with anything else are
-    left out. Both directions of a pair are there.
-    """
-    labels = np.where(scene.geom_labels > 0, scene.geom_labels, np.int32(-1))
-    labels[scene.geoms(0)] = 0
-    data = state_of(scene)
-    steps = max(1, round(0.2 / scene.model.opt.timestep))
-    sums: dict[tuple[int, int], Array] = {}
-    wrench = np.zeros(6)
-    for _ in range(steps):
-        mujoco.mj_step(scene.model, data)
-        for index, geoms in enumerate(data.contact.geom):
-            a, b = (int(label) for label in labels[geoms])
-            if a >= 0 and b >= 0 and a != b:
-                mujoco.mj_contactForce(scene.model, data, index, wrench)
-                force = wrench[:3] @ data.contact.frame[index].reshape(3, 3)
-                sums[a, b] = sums.get((a, b), np.zeros(3)) + force
-                sums[b, a] = sums.get((b, a), np.zeros(3)) - force
-    return {pair: total / steps for pair, total in sums.items()}
 
 
 def displaced_without(scene: SimulatedScene, label: int, config: PhysicsConfig) -> set[int]:
@@ -127,14 +115,15 @@ def read_truth(path: Path) -> GroundTruth:
     """Read a gt.json.
 
     Raises:
-        InputError: The file is missing, is not JSON, or its edges do not fit its vertices.
+        InputError: The file is missing, is not JSON, or its edges or surfaces do not fit its vertices.
     """
     truth = parse_json(GroundTruth, read_json(path, _REMEDY), path, _REMEDY)
     if not truth.vertices:
         raise InputError(path, "'vertices' is empty", _REMEDY)
     if len(set(truth.vertices)) != len(truth.vertices):
         raise InputError(path, "'vertices' names a body twice", "name each body once")
-    for name in [name for edge in truth.edges for name in (edge.supporter, edge.supported)]:
+    ends = [name for edge in truth.edges for name in (edge.supporter, edge.supported)]
+    for name in [*ends, *truth.surfaces]:
         if name not in truth.vertices:
             raise InputError(path, f"names {name!r}, which is not a vertex", "name one of the vertices")
     return truth
@@ -146,4 +135,5 @@ def write_truth(truth: GroundTruth, path: Path) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    write_file(path, json_text({"vertices": truth.vertices, "edges": truth.edges}).encode())
+    surfaces = {"surfaces": truth.surfaces} if truth.surfaces else {}
+    write_file(path, json_text({"vertices": truth.vertices, "edges": truth.edges} | surfaces).encode())

@@ -1,4 +1,4 @@
-"""A simulated scene: its model in physics, its table and solids, and its true shapes."""
+"""A simulated scene: its model in physics, its support surfaces and solids, and its true shapes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
@@ -18,17 +18,21 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sphere
 from caryatid.geometry.solids import Polytope, Solid
 from caryatid.geometry.transforms import Array
-from caryatid.sensing.views import SUPPORT_LABEL
+from caryatid.robots.floor import STEP
+from caryatid.sensing.views import MAX_LABEL
 
 _GEOM = mujoco.mjtGeom
 
 TABLE = "table"
-"""Name of the body that is the support surface."""
+"""Name of the body that is the main support surface where there is one."""
+
+ENDLESS = 100.0
+"""Half the side of a plane without end [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SimulatedScene:
-    """A settled table-top scene in physics.
+    """A settled scene in physics.
 
     MuJoCo changes states in place, so nothing in caryatid steps the `data` of a loaded scene; simulations use
     a copy (`state_of`).
@@ -40,8 +44,8 @@ class SimulatedScene:
         name: Short name of the scene.
         source: Its file or built-in name, for messages.
         object_bodies: Body name of each object by its label 1…n, in the order of the bodies.
-        table: Body name of the support surface.
-        geom_labels: Label (G,) of the object each geom belongs to, 0 for the table and everything else.
+        surfaces: Geoms of everything static that may carry objects, by name, the main surface first.
+        geom_labels: Label (G,) of the object each geom belongs to, 0 for everything else.
         at_rest: Whether nothing moved any more when settling ended.
     """
 
@@ -51,18 +55,22 @@ class SimulatedScene:
     name: str
     source: str
     object_bodies: dict[int, str]
-    table: str
+    surfaces: dict[str, list[int]]
     geom_labels: NDArray[np.int32]
     at_rest: bool
 
+    @property
+    def table(self) -> str:
+        """Name of the main surface: the body `table`, or else what most objects stand on."""
+        return next(iter(self.surfaces))
+
     def body_id(self, label: int) -> int:
-        """MuJoCo's number of the body with this label; 0 is the table."""
-        return int(self.model.body(self.object_bodies[label] if label else self.table).id)
+        """MuJoCo's number of the body of the object with this label."""
+        return int(self.model.body(self.object_bodies[label]).id)
 
     def geoms(self, label: int) -> list[int]:
-        """Geoms of the object with this label, or of the table with 0, including bodies welded to it."""
-        inside = np.isin(self.model.geom_bodyid, _subtree(self.model, self.body_id(label)))
-        return np.flatnonzero(inside if label == 0 else self.geom_labels == label).tolist()
+        """Geoms of the object with this label, or of the main surface with 0, with bodies welded to it."""
+        return np.flatnonzero(self.geom_labels == label).tolist() if label else self.surfaces[self.table]
 
 
 def scene_from_spec(
@@ -73,14 +81,14 @@ def scene_from_spec(
     A scene that is already at rest keeps its poses to the last digit, unless `least` is positive.
 
     Args:
-        spec: `mujoco.MjSpec` with a static body `table` and bodies with free joints.
+        spec: `mujoco.MjSpec` with static bodies or geoms, and bodies with free joints.
         name: Short name of the scene.
         source: File or built-in name, for messages.
         config: When an object is at rest.
         least: Minimum time to simulate [s], for poses that were designed and not simulated.
 
     Raises:
-        InputError: It does not compile, lacks a static body `table` or objects, or is unstable.
+        InputError: It does not compile, has no objects, nothing static carries one, or it is unstable.
     """
     try:
         with mujoco_warnings_ignored():
@@ -95,16 +103,14 @@ def scene_from_spec(
         raise InputError(source, "the pose of a body contains NaN or infinity", "give finite positions")
     table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, TABLE)
     free = sorted(model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist())
-    if table < 0:
-        raise InputError(source, f"has no body '{TABLE}'", f"name the static support surface '{TABLE}'")
-    if model.body_weldid[table] != 0:
+    if table >= 0 and model.body_weldid[table] != 0:
         raise InputError(source, f"body '{TABLE}' can move", "remove its joints: the surface is static")
-    if not np.isin(model.geom_bodyid, _subtree(model, table)).any():
+    if table >= 0 and not np.isin(model.geom_bodyid, _subtree(model, table)).any():
         raise InputError(source, f"body '{TABLE}' has no geom", "give the table a top")
     if not free:
         raise InputError(source, "has no objects", "every object is a body with a free joint")
-    if len(free) >= SUPPORT_LABEL:
-        raise InputError(source, f"has {len(free)} objects", f"at most {SUPPORT_LABEL - 1} are supported")
+    if len(free) > MAX_LABEL:
+        raise InputError(source, f"has {len(free)} objects", f"at most {MAX_LABEL} are supported")
     names = {label: str(model.body(body).name) for label, body in enumerate(free, start=1)}
     if "" in names.values():
         raise InputError(source, "an object has no name", "name every body with a free joint")
@@ -113,8 +119,89 @@ def scene_from_spec(
     if unseen := set(names) - set(geom_labels.tolist()):
         raise InputError(source, f"body '{names[min(unseen)]}' has no geom", "give every object a shape")
     data, labels = mujoco.MjData(model), geom_labels.astype(np.int32)
-    at_rest = _settle(model, data, source, config or PhysicsConfig(), least=least)
-    return SimulatedScene(model, data, spec, name, source, names, TABLE, labels, at_rest)
+    config = config or PhysicsConfig()
+    at_rest = _settle(model, data, source, config, least=least)
+    scene = SimulatedScene(model, data, spec, name, source, names, _static_geoms(model), labels, at_rest)
+    return scene if table >= 0 else _with_main_surface(scene, config.force_share)
+
+
+def _static_geoms(model: Any) -> dict[str, list[int]]:
+    """Geoms of each static body by its name, and geoms of the world by their own, the table's first.
+
+    A body without a name belongs to the one above it; everything below the table is the table.
+    """
+    table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, TABLE)
+    inside = _subtree(model, table) if table >= 0 else []
+    surfaces: dict[str, list[int]] = {TABLE: []} if table >= 0 else {}
+    for geom, body in enumerate(model.geom_bodyid.tolist()):
+        if body in inside:
+            surfaces[TABLE].append(geom)
+        elif model.body_weldid[body] == 0:
+            while body and not model.body(body).name:
+                body = int(model.body_parentid[body])
+            name = str(model.body(body).name if body else model.geom(geom).name)
+            is_body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0
+            surfaces.setdefault(name if name and is_body == bool(body) else f"geom {geom}", []).append(geom)
+    return surfaces
+
+
+def _with_main_surface(scene: SimulatedScene, share: float) -> SimulatedScene:
+    """Put first the surface that most objects stand on, directly or not; of several, the first."""
+    held = held_from_below(scene, mean_contact_forces(scene), share)
+    counts = []
+    for surface in range(len(scene.surfaces)):
+        above, new = set[int](), {-surface}
+        while new:
+            new = {b for a, b in held if a in new} - above
+            above |= new
+        counts.append(len(above))
+    if not any(counts):
+        reason = "nothing static carries an object when the scene is at rest"
+        raise InputError(scene.source, reason, "put the objects on a static body or geom, such as a floor")
+    main = list(scene.surfaces)[int(np.argmax(counts))]
+    return replace(scene, surfaces={main: scene.surfaces[main], **scene.surfaces})
+
+
+def mean_contact_forces(scene: SimulatedScene) -> dict[tuple[int, int], Array]:
+    """Mean force (3,) [N] of A on B over a fifth of a second, for each pair that touches.
+
+    A and B are labels of objects, or −k for surface k of the scene; contacts with anything else are left out.
+    Both directions of a pair are there. Soft contacts creep, so longer means would drift.
+    """
+    labels = np.where(scene.geom_labels > 0, scene.geom_labels, np.int32(-len(scene.surfaces)))
+    for surface, geoms in enumerate(scene.surfaces.values()):
+        labels[geoms] = -surface
+    data = state_of(scene)
+    steps = max(1, round(0.2 / scene.model.opt.timestep))
+    sums: dict[tuple[int, int], Array] = {}
+    wrench = np.zeros(6)
+    for _ in range(steps):
+        mujoco.mj_step(scene.model, data)
+        for index, geoms in enumerate(data.contact.geom):
+            a, b = (int(label) for label in labels[geoms])
+            if min(a, b) > -len(scene.surfaces) and a != b:
+                mujoco.mj_contactForce(scene.model, data, index, wrench)
+                force = wrench[:3] @ data.contact.frame[index].reshape(3, 3)
+                sums[a, b] = sums.get((a, b), np.zeros(3)) + force
+                sums[b, a] = sums.get((b, a), np.zeros(3)) - force
+    return {pair: total / steps for pair, total in sums.items()}
+
+
+def held_from_below(
+    scene: SimulatedScene, forces: dict[tuple[int, int], Array], share: float
+) -> set[tuple[int, int]]:
+    """Pairs of a supporter and an object that it carries, from the forces of `mean_contact_forces`.
+
+    The upward part exceeds a share of the object's weight. That of a static body also exceeds the level part:
+    a wall on which an object leans carries nothing.
+    """
+    gravity = np.linalg.norm(scene.model.opt.gravity)
+    held = set()
+    for (a, b), force in forces.items():
+        steep = a > 0 or force[2] > np.hypot(force[0], force[1])
+        if b > 0 and steep and force[2] > share * scene.model.body_subtreemass[scene.body_id(b)] * gravity:
+            held.add((a, b))
+    return held
 
 
 def _settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: float) -> bool:
@@ -169,18 +256,19 @@ def state_of(scene: SimulatedScene) -> Any:
 
 def poses_of(scene: SimulatedScene) -> Array:
     """State (N, 7) of a scene's objects: positions [m] and quaternions, w first."""
-    return np.asarray(scene.data.qpos[_addresses(scene)])
+    return np.asarray(scene.data.qpos[pose_addresses(scene)])
 
 
 def posed(scene: SimulatedScene, state: Array) -> SimulatedScene:
     """Return a scene with its objects in another state (N, 7), as from `poses_of`."""
     data = state_of(scene)
-    data.qpos[_addresses(scene)] = state
+    data.qpos[pose_addresses(scene)] = state
     mujoco.mj_forward(scene.model, data)
     return replace(scene, data=data)
 
 
-def _addresses(scene: SimulatedScene) -> Array:
+def pose_addresses(scene: SimulatedScene) -> NDArray[np.intp]:
+    """Where in MuJoCo's `qpos` the poses (N, 7) of a scene's objects are."""
     joints = [scene.model.body_jntadr[scene.body_id(label)] for label in scene.object_bodies]
     return np.asarray(scene.model.jnt_qposadr[joints][:, None] + np.arange(7))
 
@@ -215,6 +303,10 @@ Side = Literal["+x", "+y", "-y"]
 """Possible sides of walls; the robot comes from -x."""
 
 Vector = tuple[float, float, float]
+
+BOARD: Vector = (0.72, 0.58, 0.42)
+FRAME: Vector = (0.6, 0.48, 0.35)
+"""Colours of what carries objects, and of what carries that."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -257,36 +349,65 @@ def empty_spec(name: str) -> Any:
     return spec
 
 
-def build_spec(
-    bodies: Sequence[Body],
-    name: str,
-    table_size: tuple[float, float] = TABLE_SIZE,
+@dataclass(frozen=True, eq=False, slots=True)
+class Part:
+    """A box of furniture, along the axes of the world.
+
+    Attributes:
+        body: Name of its static body; empty for a geom of the world.
+        centre: Its middle (3,) [m].
+        half: Half its sizes (3,) [m].
+        colour: Red, green and blue [1].
+        name: Name of the geom, if it has one.
+    """
+
+    body: str
+    centre: Array
+    half: Array
+    colour: Vector = BOARD
+    name: str = ""
+
+
+def make_table(
+    size: tuple[float, float] = TABLE_SIZE,
     walls: Sequence[Side] = (),
-) -> Any:
-    """Build the `MjSpec` of a floor, a table, walls beside it, and bodies `object0`, `object1`, … on it."""
-    spec = empty_spec(name)
-    spec.worldbody.add_geom(name="floor", type=_GEOM.mjGEOM_PLANE, size=[10.0, 10.0, 0.1])
-    table = spec.worldbody.add_body(name=TABLE)
-
-    def put(body: Any, part: str, centre: ArrayLike, half: ArrayLike, colour: Vector) -> None:
-        body.add_geom(name=part, type=_GEOM.mjGEOM_BOX, pos=centre, size=half, rgba=(*colour, 1.0))
-
+    height: float = TABLE_HEIGHT,
+    at: tuple[float, float] = (0.0, 0.0),
+    name: str = TABLE,
+) -> list[Part]:
+    """Build a table with four legs, its size along x and y [m], and walls around it."""
+    parts = []
     # 3.2 m long, 2 m high and 6 cm thick.
     half = np.array([0.03, 1.6, 1.0])
     for index, side in enumerate(walls):
         across = "xy".index(side[1])
-        away = table_size[across] / 2.0 + (0.24, 0.32)[across] + half[0]
+        away = size[across] / 2.0 + (0.24, 0.32)[across] + half[0]
         order = [1, 0, 2] if across else [0, 1, 2]
         centre = np.array([away if side[0] == "+" else -away, 0.0, half[2]])
-        put(spec.worldbody, f"wall{index}", centre[order], half[order], (0.85, 0.85, 0.82))
+        parts.append(Part("", centre[order], half[order], (0.85, 0.85, 0.82), f"wall{index}"))
     # The top is 4 cm thick; the legs of 4 cm by 4 cm stand a little inside its corners.
-    x, y, thick = table_size[0] / 2.0, table_size[1] / 2.0, 0.04
-    under = TABLE_HEIGHT - thick
-    middle = (0.0, 0.0, TABLE_HEIGHT - thick / 2.0)
-    put(table, "table_top", middle, (x, y, thick / 2.0), (0.72, 0.58, 0.42))
+    x, y, thick = size[0] / 2.0, size[1] / 2.0, 0.04
+    under = height - thick
+    middle = np.array([*at, height - thick / 2.0])
+    parts.append(Part(name, middle, np.array([x, y, thick / 2.0]), BOARD, f"{name}_top"))
     for index, (sign_x, sign_y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        foot = (sign_x * (x - 0.75 * thick), sign_y * (y - 0.75 * thick), under / 2.0)
-        put(table, f"table_leg{index}", foot, np.array([thick, thick, under]) / 2.0, (0.6, 0.48, 0.35))
+        foot = np.array([sign_x * (x - 0.75 * thick), sign_y * (y - 0.75 * thick), under / 2.0])
+        leg = np.array([thick, thick, under]) / 2.0
+        parts.append(Part(name, foot + (*at, 0.0), leg, FRAME, f"{name}_leg{index}"))
+    return parts
+
+
+def build_spec(bodies: Sequence[Body], name: str, furniture: Sequence[Part] | None = None) -> Any:
+    """Build the `MjSpec` of a floor, furniture (by default a table), and bodies `object0`, `object1`, …."""
+    spec = empty_spec(name)
+    spec.worldbody.add_geom(name="floor", type=_GEOM.mjGEOM_PLANE, size=[10.0, 10.0, 0.1])
+    static = {"": spec.worldbody}
+    for part in make_table() if furniture is None else furniture:
+        if part.body not in static:
+            static[part.body] = spec.worldbody.add_body(name=part.body)
+        static[part.body].add_geom(
+            name=part.name, type=_GEOM.mjGEOM_BOX, pos=part.centre, size=part.half, rgba=(*part.colour, 1.0)
+        )
     for index, body in enumerate(bodies):
         add_body(spec, f"object{index}", body, palette(index))
     return spec
@@ -364,7 +485,7 @@ def _outline(scene: SimulatedScene, geom: int) -> Array:
 
 
 def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
-    """Lowest and highest corner, (3,) each [m], of the world-aligned box around an object (0: the table)."""
+    """Lowest and highest corner, (3,) each [m], of the world-aligned box around an object."""
     lows, highs = [], []
     for geom in _solid_geoms(scene, label):
         shape = _primitive(scene, geom)
@@ -402,18 +523,34 @@ def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
 
 
 def table_centre(scene: SimulatedScene) -> Array:
-    """Middle (3,) [m] of the table's largest upper face, world frame."""
+    """Middle (3,) [m] of the main surface's top, world frame; on the ground, the middle of the objects."""
+    centre, _ = _top_face(scene, scene.table)
+    if centre[2] <= STEP:
+        centre[:2] = np.median([shape.T_world_object[:2, 3] for shape in true_shapes(scene).values()], axis=0)
+    return centre
+
+
+def surface_of(scene: SimulatedScene, name: str) -> tuple[float, float, float, float, float]:
+    """Height of a surface's top, x and y of its middle, and half its sizes along x and y [m]."""
+    (x, y, height), (half_x, half_y) = (part.tolist() for part in _top_face(scene, name))
+    return height, x, y, half_x, half_y
+
+
+def _top_face(scene: SimulatedScene, name: str) -> tuple[Array, Array]:
+    """Middle (3,) and half sizes along x and y (2,) [m] of the largest upper face of a surface."""
     faces = []
-    for box in (_geom_box(scene, g) for g in scene.geoms(0)):
+    for box in (_geom_box(scene, g) for g in scene.surfaces[name]):
         R, half = box.T_world_object[:3, :3], box.extents / 2.0
         up = int(np.argmax(np.abs(R[2])))
         area = float(abs(R[2, up]) * np.prod(np.delete(half, up)))
-        faces.append((area, box.T_world_object[:3, 3] + np.copysign(half[up], R[2, up]) * R[:, up]))
-    return max(faces, key=lambda face: face[0])[1]
+        centre = box.T_world_object[:3, 3] + np.copysign(half[up], R[2, up]) * R[:, up]
+        faces.append((area, centre, np.abs(R[:2]) @ np.where(np.arange(3) == up, 0.0, half)))
+    _, centre, sizes = max(faces, key=lambda face: face[0])
+    return centre, sizes
 
 
 def _solid_geoms(scene: SimulatedScene, label: int) -> list[int]:
-    """Geoms that make up the solid of an object (0 = table): those that collide, or all if none does."""
+    """Geoms that make up the solid of an object: those that collide, or all if none does."""
     geoms, model = scene.geoms(label), scene.model
     return [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]] or geoms
 
@@ -437,4 +574,8 @@ def _primitive(scene: SimulatedScene, geom: int) -> Shape | None:
 def _geom_box(scene: SimulatedScene, geom: int) -> Box:
     """Return the box around a geom along the geom's own axes."""
     centre, half = scene.model.geom_aabb[geom, :3], scene.model.geom_aabb[geom, 3:]
+    if scene.model.geom_type[geom] == _GEOM.mjGEOM_PLANE:
+        across = scene.model.geom_size[geom, :2]
+        half = np.append(np.where(across > 0.0, across, ENDLESS), 0.01)
+        centre = np.array([0.0, 0.0, -half[2]])
     return Box(_geom_pose(scene, geom) @ transforms.rigid(np.eye(3), centre), 2.0 * half)
