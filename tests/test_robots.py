@@ -139,9 +139,18 @@ class TestHumanoidRobot:
         shut = HumanoidRobot(floor(box((0.0, 0.0, 1.0), (3.0, 3.0, 1.0))), CONFIG)
         with pytest.raises(PlanningError, match=r"hit an obstacle \(\d"):
             go_home(shut, SPHERE, CONFIG)
+        high = ViewSphere.around((0.0, 0.0, 4.0), ActiveVisionConfig())
+        with pytest.raises(PlanningError, match=r"top is 4\.00 m above the floor.* robot\.camera_height"):
+            go_home(robot, high, CONFIG)
+
+    def test_it_steps_back_from_the_floor_but_not_from_a_table(self):
+        robot = HumanoidRobot(floor(), CONFIG)
+        assert robot.view_sphere(SPHERE) is SPHERE
         low = ViewSphere.around((0.0, 0.0, 0.0), ActiveVisionConfig())
-        with pytest.raises(PlanningError, match=r"top is 0\.00 m above the floor.* robot\.camera_height"):
-            go_home(robot, low, CONFIG)
+        own = robot.view_sphere(low)
+        assert len(robot.candidates(low)) == 0 < len(robot.candidates(own))
+        assert low.radius < own.radius <= 2.0
+        assert robot.view_sphere(own) is own
 
 
 class TestRecordingRobot:

@@ -282,9 +282,7 @@ def _storeys(rng: np.random.Generator, size: int) -> _Plan:
             level = levels[len(others) if len(others) < len(levels) else int(rng.integers(len(levels)))]
             shape, below = _upright(rng), [other for other in others if level.carries(other)]
             if below and rng.random() < 0.3:
-                other = below[int(rng.integers(len(below)))]
-                reach = 0.3 * other.support(np.eye(3))[:2]
-                xy = other.T_world_object[:2, 3] + reach * rng.uniform(-1.0, 1.0, size=2)
+                xy = _over_one(rng, below)
             else:
                 half = np.array(level.outline[2:]) / 2.0 - 0.06
                 xy = level.middle + rng.uniform(-half, half)
@@ -500,11 +498,15 @@ def _let_go(
 
 
 def _on_another(rng: np.random.Generator, shape: Shape, scene: SimulatedScene) -> Body:
-    """Put a shape from the origin over a random object, up to 0.3 of its half extents off its middle."""
-    below = list(world.true_shapes(scene).values())[int(rng.integers(len(scene.object_bodies)))]
+    """Put a shape from the origin over a random object."""
+    return _let_go(shape, _over_one(rng, list(world.true_shapes(scene).values())), scene)
+
+
+def _over_one(rng: np.random.Generator, shapes: Sequence[Shape]) -> Array:
+    """A place (2,) [m] over one of several shapes, up to 0.3 of its half extents off its middle."""
+    below = shapes[int(rng.integers(len(shapes)))]
     reach = 0.3 * below.support(np.eye(3))[:2]
-    xy = below.T_world_object[:2, 3] + reach * rng.uniform(-1.0, 1.0, size=2)
-    return _let_go(shape, xy, scene)
+    return below.T_world_object[:2, 3] + reach * rng.uniform(-1.0, 1.0, size=2)
 
 
 def _overlap(shape: Shape, other: Shape) -> bool:

@@ -190,7 +190,7 @@ def mean_contact_forces(scene: SimulatedScene) -> dict[tuple[int, int], Array]:
 def held_from_below(
     scene: SimulatedScene, forces: dict[tuple[int, int], Array], share: float
 ) -> set[tuple[int, int]]:
-    """Pairs of a supporter and an object that it carries, from the forces of `mean_contact_forces`.
+    """Pairs of a supporter and an object that it carries, from forces (3,) [N] of `mean_contact_forces`.
 
     The upward part exceeds a share of the object's weight. That of a static body also exceeds the level part:
     a wall on which an object leans carries nothing.
