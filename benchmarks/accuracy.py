@@ -1,12 +1,11 @@
-"""Measure how well the loop finds support graphs: F1 per view, on simulated scenes and on recordings.
+"""Measure how well the loop finds support graphs: F1 per view, on simulated scenes.
 
     python benchmarks/accuracy.py suite [NAMES…] [--gate | --update]
-    python benchmarks/accuracy.py extract RECORDINGS… --segmentation labels
     python benchmarks/accuracy.py exact SCENES…
 
-`suite` runs the suites of the committed baseline: all of them, or only NAMES. RECORDINGS are BOP folders with
-masks and gt.json. `exact` infers supports from the true shapes. `caryatid benchmark` compares planners and
-settings with confidence intervals.
+`suite` runs the suites of the committed baseline: all of them, or only NAMES. `exact` infers supports from
+the true shapes. `caryatid benchmark` compares planners and settings with confidence intervals, and `real.py`
+scores recordings.
 """
 
 from __future__ import annotations
@@ -263,27 +262,6 @@ class SuiteRun(Gated):
 
 
 @dataclass(frozen=True)
-class Extract(Spread):
-    """Extract graphs from recordings, frame by frame, and score them."""
-
-    recordings: Annotated[tuple[str, ...], tyro.conf.Positional] = EASY
-    """BOP folders with masks and gt.json, or built-in scenes (one simulated frame each)."""
-    segmentation: SegmentationMethod = "labels"
-    """Where segments come from."""
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Settings, e.g. `--set registration.enabled=false`."""
-
-    def run(self, console: Console) -> int:
-        """Extract and print."""
-        known: dict[str, Any] = {"segmentation": self.segmentation, "settings": self.set}
-        episodes = [Episode(source, **known) for source in self.recordings]
-        rows = [row for part in self.each(extract, episodes) for row in part]
-        show_rows(rows, console, "extract")
-        self.write(rows)
-        return 0
-
-
-@dataclass(frozen=True)
 class Exact(Spread):
     """Infer supports from the true shapes; the remaining errors are what shapes cannot tell about forces."""
 
@@ -299,4 +277,4 @@ class Exact(Spread):
 
 
 if __name__ == "__main__":
-    run_main({"suite": SuiteRun, "extract": Extract, "exact": Exact})
+    run_main({"suite": SuiteRun, "exact": Exact})

@@ -2,10 +2,10 @@
 
     python benchmarks/segmentation.py [SOURCES…] --views 4 [--gate]
 
-SOURCES are folders with scene.xml, names of built-in scenes, or BOP folders with masks. Views of scenes are
-simulated: the robot's first view, and others that it can reach, far apart. Without SOURCES, the views are
-those of the built-in suite, which the committed baseline covers. Only `segment` is scored, at the pixels with
-a reading; `accuracy.py` scores what the scene model makes of the segments. Figures are per family of scenes.
+SOURCES are folders with scene.xml, or names of built-in scenes. Views are simulated: the robot's first view,
+and others that it can reach, far apart. Without SOURCES, the views are those of the built-in suite, which the
+committed baseline covers. Only `segment` is scored, at the pixels with a reading; `accuracy.py` scores what
+the scene model makes of the segments, `real.py` does so for recordings. Figures are per family of scenes.
 """
 
 from __future__ import annotations
@@ -30,12 +30,11 @@ from caryatid.config.settings import read_settings
 from caryatid.errors import CaryatidError
 from caryatid.evaluation.oracle import spread_out
 from caryatid.evaluation.scores import assign, mask_ious
-from caryatid.io.bop import read_recording
 from caryatid.segmentation.observation import observe
 from caryatid.segmentation.segments import segment
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import View
-from caryatid.sources import kind_of, open_source
+from caryatid.sources import open_source
 
 BUILT_IN = (*EASY, *(f"dense-{size}-{seed}" for seed, size in enumerate(range(10, 18, 2), start=1)))
 """Sources to segment if none are given."""
@@ -53,15 +52,12 @@ class Segmentation(Gated, Simulated):
     """Segment views, and compare the segments with true masks."""
 
     sources: Annotated[tuple[str, ...], tyro.conf.Positional] = BUILT_IN
-    """Scene folders, names of built-in scenes, or BOP folders."""
+    """Scene folders, or names of built-in scenes."""
     views: int = 4
-    """Number of views of each scene; a recording has its own."""
+    """Number of views of each scene."""
 
     def views_of(self, source: str, config: Config) -> Iterator[View]:
         """Yield the views of a source, with true labels."""
-        if kind_of(source) == "recording":
-            yield from read_recording(source)
-            return
         opened = open_source(source, config, noise=self.noise, segmentation="labels", seed=self.seed)
         if opened.truth is None:
             raise CaryatidError(f"{source}: has no ground truth to score against")

@@ -1,14 +1,21 @@
-"""The accuracy benchmark: which figures are kept of rows, when the gate fails."""
+"""The benchmarks: which figures are kept of rows, when the gate fails, how real recordings are scored."""
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from caryatid.benchmark.episodes import SCORES
+from caryatid.errors import CaryatidError
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box
+from caryatid.graph import SceneObject, Support, SupportGraph, object_id
+from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.scenes import is_builtin
 from caryatid.simulation.truth import GroundTruth, TrueEdge, write_truth
 
@@ -17,6 +24,7 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import accuracy  # noqa: E402
 import measures  # noqa: E402
+import real  # noqa: E402
 
 ROW = dict.fromkeys(SCORES, 1.0) | {"scene": "tower", "view": 5, "f1": 0.9, "edge_recall": 0.8}
 ROW |= {"objects": 5, "returned": 5, "matched": 5}
@@ -74,3 +82,101 @@ def test_a_recording_is_scored_frame_by_frame(recording):
     assert [r["view"] for r in scored] == [1, 2, 3]
     assert all((r["objects"], r["returned"], r["matched"]) == (2, 2, 2) for r in scored[-1:])
     assert scored[-1]["f1"] == 1.0
+
+
+def squares(*corners, size=20):
+    """Label image with a square at each corner (x, y), numbered from 1."""
+    image = np.zeros((80, 120), dtype=np.int32)
+    for label, (x, y) in enumerate(corners, 1):
+        image[y : y + size, x : x + size] = label
+    return image
+
+
+TRUE = squares((10, 10), (50, 10), (90, 40))
+
+
+def test_the_true_masks_score_100_whatever_their_numbers():
+    assert set(real.compare_masks(np.array([0, 7, 3, 5], dtype=np.int32)[TRUE], TRUE, 1.0).values()) == {
+        100.0
+    }
+
+
+def test_a_shift_beyond_the_tolerance_costs_more_of_the_boundary_than_of_the_overlap():
+    shifted = np.roll(TRUE, 2, axis=1)
+    within, beyond = (real.compare_masks(shifted, TRUE, tolerance) for tolerance in (2.0, 1.0))
+    assert within["overlap F"] == beyond["overlap F"] == pytest.approx(90.0)
+    assert within["boundary F"] == 100.0
+    assert 45.0 < beyond["boundary F"] < 70.0
+    assert within["%75"] == 100.0
+
+
+def test_merged_masks_keep_recall_of_one_and_lose_the_others():
+    merged = real.compare_masks(np.minimum(TRUE, 1), TRUE, 6.0)
+    assert merged["overlap P"] == merged["overlap R"] == pytest.approx(100.0 / 3.0)
+    assert merged["%75"] == 0.0
+
+
+@pytest.mark.parametrize(("found", "true", "precision", "recall"), [(0, 1, 100.0, 0.0), (1, 0, 0.0, 100.0)])
+def test_nothing_found_is_precise_and_nothing_to_find_is_complete(found, true, precision, recall):
+    figures = real.compare_masks(TRUE * found, TRUE * true, 6.0)
+    assert (figures["overlap P"], figures["overlap R"], figures["overlap F"]) == (precision, recall, 0.0)
+
+
+CLICKED = real.Annotation(
+    {"a": [(20, 20)], "b": [(60, 20)], "c": [(95, 50), (105, 50)]}, [("T", "a"), ("T", "b"), ("a", "c")], []
+)
+
+
+def graph_of(labels, *edges):
+    """A graph of a table, 65535, and of objects with these labels, with supports by their labels."""
+    shape = Box(transforms.rigid(np.eye(3), np.zeros(3)), np.ones(3))
+    table = SceneObject("o0", SUPPORT_LABEL, shape, "support_surface")
+    objects = [SceneObject(object_id(label), label, shape) for label in labels]
+    supports = [Support(object_id(a), object_id(b), probability=p) for a, b, p in edges]
+    return SupportGraph((table, *objects), tuple(supports))
+
+
+def test_clicked_objects_and_supports_are_found():
+    edges = (SUPPORT_LABEL, 1, 0.9), (SUPPORT_LABEL, 2, 0.9), (1, 3, 0.8)
+    row = real.score_clicks(graph_of((1, 2, 3), *edges), TRUE, CLICKED)
+    assert [row[name] for name in real.CLICKS] == [3, 3, 0, 0, 0, 0, 0, 3, 3, 0]
+    assert row["AP"] == 1.0
+
+
+def test_merged_split_missed_and_invented_objects_are_told_apart():
+    image = squares((10, 10), (50, 10), (90, 40), (100, 40), (30, 50), size=20)
+    image[image == 2] = 1
+    row = real.score_clicks(graph_of((1, 3, 4, 5)), image, CLICKED)
+    assert {name: row[name] for name in real.CLICKS[1:6]} == {
+        "found": 0, "merged": 2, "split": 1, "missed": 0, "invented": 1
+    }  # fmt: skip
+    row = real.score_clicks(graph_of((2, 3)), TRUE, CLICKED)
+    assert (row["found"], row["missed"]) == (2, 1)
+
+
+def test_wrong_and_lacking_supports_lower_the_average_precision():
+    edges = (2, 3, 0.95), (SUPPORT_LABEL, 1, 0.9), (SUPPORT_LABEL, 2, 0.9)
+    row = real.score_clicks(graph_of((1, 2, 3), *edges), TRUE, CLICKED)
+    assert (row["right"], row["wrong"]) == (2, 1)
+    assert row["AP"] == pytest.approx(2.0 / 3.0 * 2.0 / 3.0)
+
+
+def test_a_click_outside_the_image_is_an_error():
+    outside = real.Annotation({"a": [(120, 20)]}, [], [])
+    with pytest.raises(CaryatidError, match="outside the 120×80 pixels"):
+        real.score_clicks(graph_of((1,)), TRUE, outside)
+
+
+def test_a_recording_of_several_views_is_scored_with_its_masks_and_without(recording, tmp_path):
+    edges = TrueEdge("table", "object1"), TrueEdge("object1", "object2")
+    write_truth(GroundTruth(("table", "object1", "object2"), edges), recording / "gt.json")
+    out = tmp_path / "rows.json"
+    assert real.Real(jobs=1, out=out, folders=(recording.parent,), only=(recording.name,)).run(Console()) == 0
+    auto, labels = json.loads(out.read_text())
+    assert (auto["segments"], labels["segments"]) == ("auto", "labels")
+    assert labels["views"] | {"shape IoU": 0} == {
+        "views": 3, "objects": 2, "changes": 0, "pose warnings": 0, "shape IoU": 0
+    }  # fmt: skip
+    assert labels["views"]["shape IoU"] > 0.8
+    assert labels["masks"]["F1"] == labels["masks"]["AP"] == 1.0
+    assert len(auto["masks"]["frames"]) == len(auto["ms"]) == 3
