@@ -13,7 +13,7 @@ from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sph
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph
 from caryatid.scene import Scene
-from caryatid.segmentation.support_plane import SupportSurface
+from caryatid.segmentation.support_plane import Region, SupportSurface
 from caryatid.sensing.clouds import oriented_points
 from caryatid.sensing.view_sphere import direction
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
@@ -68,7 +68,9 @@ def surface_at(height: float = TABLE_TOP) -> SupportSurface:
         [[-0.35, -0.5, height], [0.35, -0.5, height], [0.35, 0.5, height], [-0.35, 0.5, height]]
     )
     top = box((0.0, 0.0, height - 0.02), (0.7, 1.0, 0.04))
-    return SupportSurface(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, height]), corners, top)
+    middle = np.array([0.0, 0.0, height])
+    region = Region(np.array([-18, -25]), np.ones((36, 50), dtype=np.bool_), 0.02)
+    return SupportSurface(np.array([0.0, 0.0, 1.0]), middle, corners, top, region)
 
 
 def random_motion(rng: np.random.Generator, reach: float = 1.0) -> Array:

@@ -31,8 +31,7 @@ from caryatid.objects.fusion import (
 )
 from caryatid.scene import Scene
 from caryatid.segmentation.observation import Observation
-from caryatid.segmentation.support_plane import SupportSurface
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+from caryatid.sensing.views import Cloud, View
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.support.equilibrium import touching
 from caryatid.support.relations import make_support, nearest_contacts, sort_objects
@@ -88,19 +87,19 @@ class ViewScene(PaperScene):
     def _find_appeared(self, observation: Observation, voxels: VoxelMap) -> dict[int, str]:
         return super()._find_appeared(observation, voxels) if self.identified else {}
 
-    def _bounds(self, observation: Observation) -> tuple[SupportSurface, VoxelMap]:
-        """Add the view to the map; return the limits of hidden extents, of this view alone."""
-        super()._bounds(observation)
+    def _mapped(self, observation: Observation) -> VoxelMap:
+        """Add the view to the map; return one of this view alone."""
+        super()._mapped(observation)
         assert self.sphere is not None
         voxels = VoxelMap.around(self.sphere.centre_world, self.config.voxels)
         if observation.view is not None:
             voxels = voxels.integrate(observation.view, self.config.cloud.max_depth)
-        return observation.surface, voxels
+        return voxels
 
     def _form_objects(
         self, observation: Observation, shown: set[int], voxels: VoxelMap, table: Array, given: bool
     ) -> Observation:
-        self._models.fit_newest(set(observation.shown) - {0, SUPPORT_LABEL}, voxels)
+        self._models.fit_newest(set(observation.shown_objects), voxels)
         return observation
 
     def _surfaces(self) -> dict[str, tuple[Array, Array]]:

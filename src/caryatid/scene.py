@@ -19,7 +19,6 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import UP, Array
 from caryatid.graph import (
-    SUPPORT_SURFACE_ID,
     Change,
     ChangeKind,
     SceneObject,
@@ -35,7 +34,7 @@ from caryatid.runtime import Pictured, call
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.segmentation.holes import count_holes
 from caryatid.segmentation.observation import Observation, label_image, observe
-from caryatid.segmentation.support_plane import SupportSurface, refitted
+from caryatid.segmentation.support_plane import SupportSurface, find_surface_below, refitted
 from caryatid.segmentation.view_checks import (
     check_camera,
     check_centre,
@@ -47,7 +46,7 @@ from caryatid.segmentation.view_checks import (
 )
 from caryatid.sensing.registration import ViewRegistration
 from caryatid.sensing.view_sphere import ViewSphere
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View, check_labels
+from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View, check_labels
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.support.plausibility import reconcile
 from caryatid.support.relations import Effect, explain, infer, predict_removal
@@ -78,7 +77,7 @@ class Scene(Pictured):
     Attributes:
         graph: The fused support graph.
         labels: Label image (H, W) of the newest view, or labels (N,) of a cloud; 65535 = support surface.
-        surface: The support surface, or None before the first view that shows one.
+        surfaces: The support surfaces, the main one first; none before the first view that shows one.
         voxels: Free, occupied and unknown space, or None before that view.
         sphere: The view sphere around the table top, or None before that view.
         T_world_camera: Pose (4, 4) of the newest view after registration, or None for a cloud.
@@ -113,7 +112,7 @@ class Scene(Pictured):
         self.seed = seed
         self.graph = SupportGraph()
         self.labels: NDArray[np.int32] | None = None
-        self.surface: SupportSurface | None = None
+        self.surfaces: tuple[SupportSurface, ...] = ()
         self.voxels: VoxelMap | None = None
         self.sphere: ViewSphere | None = None
         self.T_world_camera: Array | None = None
@@ -130,6 +129,11 @@ class Scene(Pictured):
         self._ids: dict[int, str] = {}
         self._detector = ChangeDetector()
         self._labelled: bool | None = None
+
+    @property
+    def surface(self) -> SupportSurface | None:
+        """The main support surface, or None before the first view that shows one."""
+        return next(iter(self.surfaces), None)
 
     @property
     def supports(self) -> nx.DiGraph:
@@ -311,10 +315,9 @@ class Scene(Pictured):
 
     def _reported(self, kind: ChangeKind, object_id: str) -> None:
         """Record what the robot did, and derive the graph again."""
-        assert self.surface is not None
         assert self.voxels is not None
         self._detector.report(Change(kind, object_id, self.views, "reported by the robot"))
-        newest = self._inferred(self.surface, self.voxels)
+        newest = self._inferred(self.voxels)
         names = {o.id: self._ids.get(o.label, o.id) for o in newest.objects if o.role == "object"}
         newest = renamed(newest, names)
         self._graphs = (*self._graphs[:-1], newest)
@@ -364,7 +367,7 @@ class Scene(Pictured):
             raise InputError(source.name, reason, "give labels for every view, or for none")
         try:
             if self.waiting:
-                self.surface = self._observed(source).surface
+                self.surfaces = self._observed(source).surfaces
             waiting, self.waiting = self.waiting, ()
             for view in (*waiting, source):
                 try:
@@ -383,7 +386,7 @@ class Scene(Pictured):
 
     def _observed(self, source: View | Cloud) -> Observation:
         rng = np.random.default_rng([self.seed, self.views])
-        return observe(source, self.config, segmentation=self.segmentation, known=self.surface, rng=rng)
+        return observe(source, self.config, segmentation=self.segmentation, known=self.surfaces, rng=rng)
 
     @one_blas_thread
     def _take_in(self, source: View | Cloud) -> None:
@@ -408,7 +411,7 @@ class Scene(Pictured):
         missing, new = self._changes_seen(observation)
         if self.surface and before and self._registration and observation.view:
             # If everything it shows had changed, the pose would be wrong instead.
-            explained = list(new) if set(observation.shown) - new.keys() - {0, SUPPORT_LABEL} else []
+            explained = list(new) if set(observation.shown_objects) - new.keys() else []
             unexplained = observation.cloud.select(~np.isin(observation.labels, explained))
             check_free(unexplained, self.surface, before, self.config)
         if not named:
@@ -416,16 +419,20 @@ class Scene(Pictured):
         if named and self.views:
             self._check_identity(observation, source.name)
         shown = self._models.add(observation, self.views) | moved
-        self.surface = self._fused_surface(observation)
-        surface, voxels = self._bounds(observation)
+        self.surfaces = self._fused_surfaces(observation)
+        voxels = self._mapped(observation)
         watch.lap("map")
-        below = voxels.closed_below(surface.outline_world, surface.normal_world)
-        table = observation.footprint(surface, self.config.explanation.spacing)
+        below = voxels
+        for surface in self._carrying(observation):
+            lowest = surface.point_world[2] <= voxels.origin_world[2] + self.config.voxels.below
+            depth = np.inf if lowest else float(surface.shape.extents[2])
+            below = below.closed_below(surface.outline_world, surface.normal_world, depth)
+        table = observation.footprint(self.surfaces, self.config.explanation.spacing)
         observation = self._form_objects(observation, shown, below, table, given)
         if not named:
             observation, new = self._reidentified(observation, new)
         watch.lap("fit")
-        newest = self._inferred(surface, voxels)
+        newest = self._inferred(voxels)
         watch.lap("infer")
         observation = self._fused(observation, newest, given)
         names = {k: self._ids.get(k, object_id(k)) for k in (*self._models.points.objects, *new)}
@@ -490,8 +497,8 @@ class Scene(Pictured):
 
     def _check_found(self, observation: Observation, name: str, masks: bool) -> None:
         """Warn if there are readings above the support surface but no object."""
-        if set(observation.shown) <= {0, SUPPORT_LABEL}:
-            low, high = self.config.segmentation.clearance, self.config.surface.storey
+        if not observation.shown_objects:
+            low, high = self.config.segmentation.clearance, self.config.segmentation.max_height
             over = observation.surface.over(observation.cloud.points_world, low, high, 0.0)
             if over.sum() * self.config.cloud.voxel**2 >= self.config.segmentation.min_area:
                 remedy = "no mask covers them" if masks else "move closer, or give a larger image or masks"
@@ -516,34 +523,38 @@ class Scene(Pictured):
         moves = registration.add(observation.cloud, same_labels=self.identified)
         observation = observation.moved(moves.pop(self.views))
         seen = self._models.points.of(SUPPORT_LABEL)
-        if (
-            self.surface
-            and self.voxels
-            and observation.view
-            and len(seen.points_world) >= config.surface.min_points
-        ):
-            check_place(observation.cloud, registration.aligned, self.surface, self.voxels, config)
+        if self.voxels and observation.view and len(seen.points_world) >= config.surface.min_points:
+            check_place(observation.cloud, registration.aligned, self.surfaces, self.voxels, config)
         self._registration = registration
-        return observation, self._models.points.move(moves) - {SUPPORT_LABEL}
+        return observation, {k for k in self._models.points.move(moves) if k <= MAX_LABEL}
 
-    def _fused_surface(self, observation: Observation) -> SupportSurface:
-        """The support surface from the points of all views."""
-        table = self._models.points.of(SUPPORT_LABEL)
-        if self.views == 0 or len(table.points_world) < self.config.surface.min_points:
-            return observation.surface
-        known, config = self.surface or observation.surface, self.config.surface
-        fused = refitted(known, table.points_world, table.normals_world, UP, config)
-        return known if fused is None else fused
+    def _fused_surfaces(self, observation: Observation) -> tuple[SupportSurface, ...]:
+        """The support surfaces from the points of all views."""
+        fused, config = list(observation.surfaces), self.config.surface
+        for k, known in enumerate(self.surfaces):
+            own = self._models.points.of(SUPPORT_LABEL - k)
+            if len(own) >= config.min_points:
+                fused[k] = refitted(known, own.points_world, own.normals_world, UP, config) or known
+        return tuple(fused)
 
-    def _bounds(self, observation: Observation) -> tuple[SupportSurface, VoxelMap]:
-        """Add the view to the map; return the limits of hidden extents."""
+    def _carrying(self, observation: Observation) -> list[SupportSurface]:
+        """The main surface, and those that carry something as far as is known."""
+        points = observation.cloud.points_world[(observation.labels > 0) & (observation.labels <= MAX_LABEL)]
+        known = {SUPPORT_LABEL - o.label for o in self.graph.support_surfaces}
+        numbers = {0, *known, *find_surface_below(self.surfaces, points).tolist()}
+        return [self.surfaces[k] for k in sorted(numbers) if k < len(self.surfaces)]
+
+    def _mapped(self, observation: Observation) -> VoxelMap:
+        """Add the view to the map, which reaches below all surfaces that carry something."""
         if self.sphere is None or self.voxels is None:
             centre = observation.surface.point_world
             self.sphere = ViewSphere.around(centre, self.config.active)
             self.voxels = VoxelMap.around(centre, self.config.voxels)
+        lowest = min(float(surface.point_world[2]) for surface in self._carrying(observation))
+        self.voxels = self.voxels.lowered(lowest - self.config.voxels.below)
         if observation.view is not None:
             self.voxels = self.voxels.integrate(observation.view, self.config.cloud.max_depth)
-        return self.surface or observation.surface, self.voxels
+        return self.voxels
 
     def _form_objects(
         self, observation: Observation, shown: set[int], voxels: VoxelMap, table: Array, given: bool
@@ -606,7 +617,7 @@ class Scene(Pictured):
     def _find_appeared(self, observation: Observation, voxels: VoxelMap) -> dict[int, str]:
         """Labels of the segments in space that was free, each with a reason."""
         assert observation.view is not None
-        rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
+        rows = np.flatnonzero((observation.labels > 0) & (observation.labels <= MAX_LABEL))
         points = observation.cloud.points_world[rows]
         return appeared(observation.view.name, points, observation.labels[rows], voxels.states_around(points))
 
@@ -628,13 +639,18 @@ class Scene(Pictured):
             self._models.rename(old, label)
         return self._renamed(observation, found), {found.get(k, k): why for k, why in new.items()}
 
-    def _inferred(self, surface: SupportSurface, voxels: VoxelMap) -> SupportGraph:
-        """The support graph of the current objects."""
+    def _inferred(self, voxels: VoxelMap) -> SupportGraph:
+        """The support graph of the objects, and of the surfaces that carry something beside the main one."""
         fitted = self._models.objects()
         if self.config.completion.enabled:
-            fitted = complete(fitted, surface, voxels, self.config.completion)
-        table = SceneObject(SUPPORT_SURFACE_ID, SUPPORT_LABEL, surface.shape, "support_surface")
-        return self._infer_supports(reconcile([table, *fitted], self.config.plausibility))
+            fitted = complete(fitted, self.surfaces, voxels, self.config.completion)
+        surfaces = [
+            SceneObject(object_id(SUPPORT_LABEL - k), SUPPORT_LABEL - k, surface.shape, "support_surface")
+            for k, surface in enumerate(self.surfaces)
+        ]
+        graph = self._infer_supports(reconcile([*surfaces, *fitted], self.config.plausibility))
+        carrying = {s.supporter for s in graph.supports}
+        return without(graph, {o.id for o in surfaces[1:] if o.id not in carrying})
 
     def _infer_supports(self, objects: Sequence[SceneObject]) -> SupportGraph:
         """The support graph of shapes."""

@@ -94,10 +94,8 @@ class SurfaceConfig:
     """Maximum angle between the normals of a point and its plane [deg]; 3σ of normals from depth."""
     gap: Positive = 0.3
     """Regions of one plane farther apart than this are two surfaces [m]; occlusion shadows are narrower."""
-    min_area: NotNegative = 0.05
-    """Minimum visible area of a table [m²]; larger than the top of most objects."""
-    storey: NotNegative = 0.6
-    """A plane this far below a table is the floor [m]; a smaller step is the top of an object."""
+    min_width: NotNegative = 0.24
+    """Minimum width of furniture [m]; a large hand spans as much, and holds no object that is wider."""
     min_points: Count = 200
     """Minimum number of inliers of a table [points]; a tenth of `min_area` at 5 mm."""
     search: Positive = 0.05

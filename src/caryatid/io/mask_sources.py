@@ -149,7 +149,7 @@ class OnnxMasks:
     def _prompts(self, view: View) -> Array:
         """Boxes (N, 4) around the automatic segments of a view [px]."""
         rng = np.random.default_rng(self._seed)
-        observation = observe(view, self._config, segmentation="auto", known=None, rng=rng)
+        observation = observe(view, self._config, segmentation="auto", known=(), rng=rng)
         labels = label_image(observation, view)
         boxes = []
         for label in observation.shown_objects:

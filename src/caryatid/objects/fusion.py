@@ -96,7 +96,8 @@ def renamed(graph: SupportGraph, names: Mapping[str, str]) -> SupportGraph:
 def without(graph: SupportGraph, ids: Set[str]) -> SupportGraph:
     """Return a graph without some objects and their supports."""
     objects = tuple(o for o in graph.objects if o.id not in ids)
-    return SupportGraph(objects, tuple(s for s in graph.supports if ids.isdisjoint(s.pair)))
+    supports = tuple(s for s in graph.supports if ids.isdisjoint(s.pair))
+    return SupportGraph(objects, supports, {i: v for i, v in graph.stability.items() if i not in ids})
 
 
 def fused_graph(

@@ -13,7 +13,7 @@ from caryatid.geometry.shapes import Cylinder, Primitives, Shape, Sphere
 from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject
-from caryatid.segmentation.support_plane import SupportSurface
+from caryatid.segmentation.support_plane import SupportSurface, find_surface_below
 from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 SPACING = 0.015
@@ -27,7 +27,10 @@ Face = tuple[Array, Array]
 
 
 def complete(
-    objects: Sequence[SceneObject], surface: SupportSurface, voxels: VoxelMap, config: CompletionConfig
+    objects: Sequence[SceneObject],
+    surfaces: Sequence[SupportSurface],
+    voxels: VoxelMap,
+    config: CompletionConfig,
 ) -> list[SceneObject]:
     """Extend the unseen lower side of each object until it meets free space, another shape or the table.
 
@@ -37,7 +40,7 @@ def complete(
 
     Args:
         objects: Objects without the support surface; `seen` says which sides points confirm.
-        surface: The table top.
+        surfaces: The support surfaces, the main one first.
         voxels: The voxel map.
         config: Tolerances.
     """
@@ -46,6 +49,7 @@ def complete(
     lowest = [o.shape.surface(SPACING)[0][:, 2].min() for o in objects]
     for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
         others = [o.shape for n, o in enumerate(done) if n != k]
+        surface = surfaces[find_surface_below(surfaces, done[k].centre_world[None])[0]]
         done[k] = _extend_downwards(done[k], others, surface, voxels, config)
     return done
 

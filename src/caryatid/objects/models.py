@@ -35,7 +35,7 @@ from caryatid.objects.solids import as_solid
 from caryatid.runtime.parallel import on_threads
 from caryatid.segmentation.observation import Observation
 from caryatid.sensing.clouds import thin
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud
+from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud
 from caryatid.sensing.voxel_map import VoxelMap
 
 OtherColour = Callable[[int, NDArray[np.intp]], NDArray[np.bool_]]
@@ -83,7 +83,7 @@ class ObjectPoints:
         self._labels = np.insert(self._labels, after, labels)
         changed = set(np.unique(labels).tolist())
         self._forget(changed)
-        self.labels_used = max(self.labels_used, *(changed - {SUPPORT_LABEL}), 0)
+        self.labels_used = max(self.labels_used, *(k for k in changed if k <= MAX_LABEL), 0)
 
     def put(self, cloud: Cloud, label: int, view: int) -> None:
         """Add points of an object that no view showed; its colour stays unknown."""
@@ -95,7 +95,7 @@ class ObjectPoints:
     def objects(self) -> list[int]:
         """Labels of the objects, without the support surface."""
         labels: list[int] = np.flatnonzero(np.bincount(self._labels)).tolist()
-        return [k for k in labels if k != SUPPORT_LABEL]
+        return [k for k in labels if k <= MAX_LABEL]
 
     def of(self, label: int, edge: float = 0.0) -> Cloud:
         """Points of an object: all, or of those in each voxel of this edge [m] the one nearest their mean."""
@@ -289,7 +289,7 @@ class ObjectModels:
             new: Labels of segments that belong to no known object.
         """
         points, labels = observation.cloud.points_world, observation.labels
-        segments = np.where(labels == SUPPORT_LABEL, 0, labels)
+        segments = np.where(labels > MAX_LABEL, 0, labels)
         if observation.view is not None and not masks:
             kept = np.flatnonzero(segments)
             kept = kept[thin(points[kept], self._config.explanation.spacing)]
@@ -313,7 +313,7 @@ class ObjectModels:
         for pair in observation.apart:
             names = frozenset(int(np.bincount(named[labels == label]).argmax()) for label in pair)
             self._distinct |= {names} if len(names) == 2 else set()
-        return observation.with_labels(np.where(labels == SUPPORT_LABEL, labels, named))
+        return observation.with_labels(np.where(labels > MAX_LABEL, labels, named))
 
     def _other_colour(self, observation: Observation) -> OtherColour | None:
         """Which points of a view have another colour than a plain object; None if the view has no colours."""
@@ -337,7 +337,7 @@ class ObjectModels:
     def mislabelled(self, observation: Observation) -> tuple[int, int]:
         """Number of labels of a view that lie on objects with other labels, and number of its labels."""
         config = self._config.segmentation
-        rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
+        rows = np.flatnonzero((observation.labels > 0) & (observation.labels <= MAX_LABEL))
         rows = rows[:: len(rows) // 1000 + 1]  # some are enough to tell where a mask lies
         points = observation.cloud.points_world[rows]
         shown, index, count = np.unique(observation.labels[rows], return_inverse=True, return_counts=True)
@@ -355,12 +355,12 @@ class ObjectModels:
         shown = set(observation.shown) - {0}
         voxels = np.full(max(shown, default=0) + 1, config.cloud.voxel)
         voxels[0] = 0.0
-        voxels[SUPPORT_LABEL:] = config.surface.spacing
+        voxels[MAX_LABEL + 1 :] = config.surface.spacing
         kept = most_central(observation.cloud.points_world, observation.labels, voxels)
         self.points.add(observation.cloud.select(kept), observation.labels[kept], view)
         edges = {label: float(voxels[label]) for label in shown}
         self.points.bound(edges, config.cloud.views, config.cloud.depth)
-        return shown - {SUPPORT_LABEL}
+        return {label for label in shown if label <= MAX_LABEL}
 
     def fit_newest(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
         """Fit objects to the newest view's points alone, and forget all other fits (`sg`).

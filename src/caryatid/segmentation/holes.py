@@ -6,7 +6,6 @@ import numpy as np
 from scipy import ndimage
 
 from caryatid.config import SegmentationConfig
-from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import View
@@ -33,13 +32,12 @@ def count_holes(view: View, surface: SupportSurface, config: SegmentationConfig)
     K = view.K / np.array([[step], [step], [1.0]])
     depth = view.depth[every]
     ignored = np.zeros(depth.shape, dtype=bool) if view.ignored is None else view.ignored[every]
-    surface = surface.moved(transforms.invert(view.pose))
     v, u = np.indices(depth.shape)
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(depth.shape)], axis=-1)
     # 1/z of the surface; negative above its horizon.
-    level: Array = rays @ surface.normal_world / (surface.normal_world @ surface.point_world)
+    level: Array = rays @ (surface.normal_world @ view.pose[:3, :3]) / -surface.height(view.pose[:3, 3])
     there = np.divide(1.0, level, out=np.zeros(level.shape), where=level > 0.0)
-    on_surface = View(there.astype(np.float32), K, ignored=ignored)
+    on_surface = View(there.astype(np.float32), K, view.pose, ignored=ignored)
     over = surface.pixels_over(on_surface, -config.clearance, config.clearance, 0.0)
     # Ignored pixels count as infinitely near: shadows beside them have any width.
     inverse_depth = np.divide(1.0, depth, out=np.where(ignored, np.inf, 0.0), where=depth > 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -14,9 +15,11 @@ from caryatid.config import CloudConfig, Config, SegmentationMethod
 from caryatid.errors import InputError, NoSurfaceError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import UP, Array
-from caryatid.runtime.parallel import kernel
+from caryatid.segmentation.foreground import find_bodies, find_foreground, find_furniture
+from caryatid.segmentation.samples import Labels
+from caryatid.segmentation.seams import Pairs
 from caryatid.segmentation.segments import segment, segment_cloud
-from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
+from caryatid.segmentation.support_plane import SupportSurface, find_support_surfaces, find_surface_below
 from caryatid.sensing.clouds import oriented_points, thin
 from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View
 
@@ -39,15 +42,20 @@ class Observation:
         view: The view, posed and thinned; None for a cloud.
         cloud: Oriented points in the world frame with labels: 0 nothing, 65535 the support surface.
         pixels: Flat index (N,) of each point in the image, or in the cloud it came from.
-        surface: The support surface as this view shows it.
+        surfaces: The support surfaces as this view shows them, the main one first.
         apart: Pairs (P, 2) of labels, as `observe` gives them, that this view shows to be two bodies.
     """
 
     view: View | None
     cloud: Cloud
     pixels: NDArray[np.intp]
-    surface: SupportSurface
+    surfaces: tuple[SupportSurface, ...]
     apart: NDArray[np.int32]
+
+    @property
+    def surface(self) -> SupportSurface:
+        """The main support surface."""
+        return self.surfaces[0]
 
     @property
     def labels(self) -> NDArray[np.int32]:
@@ -82,17 +90,22 @@ class Observation:
         """Return the observation with other labels (N,)."""
         return replace(self, cloud=replace(self.cloud, labels=labels))
 
-    def footprint(self, surface: SupportSurface, spacing: float) -> Array:
-        """Places (M, 3) of the surface straight below points of objects, one per square of a spacing [m]."""
-        points = self.cloud.points_world[(self.labels != 0) & (self.labels != SUPPORT_LABEL)]
-        feet = points - surface.height(points)[:, None] * surface.normal_world
-        feet = feet[surface.over(feet, -np.inf, np.inf, 0.0)]
-        return feet[thin(feet, spacing)]
+    def footprint(self, surfaces: Sequence[SupportSurface], spacing: float) -> Array:
+        """Places (M, 3) of surfaces straight below points of objects, one per square of a spacing [m]."""
+        points = self.cloud.points_world[(self.labels > 0) & (self.labels <= MAX_LABEL)]
+        below, feet = find_surface_below(surfaces, points), [np.empty((0, 3))]
+        for k, surface in enumerate(surfaces):
+            own = points[below == k]
+            own = own[surface.region.holds(own)]
+            feet.append(own - surface.height(own)[:, None] * surface.normal_world)
+        places = np.concatenate(feet)
+        return places[thin(places, spacing)]
 
     def moved(self, T: Array) -> Observation:
         """Return the observation moved by a rigid transform (4, 4) of the world."""
         view = None if self.view is None else self.view.with_pose(T @ self.view.pose)
-        return replace(self, view=view, cloud=self.cloud.moved(T), surface=self.surface.moved(T))
+        surfaces = tuple(surface.moved(T) for surface in self.surfaces)
+        return replace(self, view=view, cloud=self.cloud.moved(T), surfaces=surfaces)
 
 
 def observe(
@@ -100,16 +113,16 @@ def observe(
     config: Config,
     *,
     segmentation: SegmentationMethod | None,
-    known: SupportSurface | None,
+    known: Sequence[SupportSurface],
     rng: np.random.Generator,
 ) -> Observation:
-    """Find the support surface and the segments on it.
+    """Find the support surfaces and the segments on them.
 
     Args:
         source: A view (only the first one may lack a pose: the table then gives it one) or a cloud, z up.
         config: All stages' settings.
         segmentation: `labels` requires labels, `auto` ignores them, None uses them where given.
-        known: The known support surface, or None.
+        known: The support surfaces known so far, the main one first.
         rng: Source of the samples.
 
     Raises:
@@ -122,7 +135,7 @@ def observe(
     use_labels = source.labels is not None and segmentation != "auto"
     source = thinned(source, config.cloud)
     if isinstance(source, View) and source.T_world_camera is None:
-        if known is not None:
+        if known:
             raise InputError(source.name, "has no camera pose", "give one; only the first view may lack it")
         source = source.with_pose(level_transform(source, config, rng, use_labels=use_labels))
     if use_labels and isinstance(source, View):
@@ -131,21 +144,52 @@ def observe(
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     pose = source.T_world_camera if isinstance(source, View) else None
     if given is not None:
-        given = _without_table(cloud, given, known, UP, config, rng)
-    surface = _surface(cloud, given, known, UP, config, rng, pose)
+        given = _without_table(cloud, given, known, UP, config, rng, pose)
+    surfaces = _find_surfaces(cloud, given, known, UP, config, rng, pose)
+    if isinstance(source, View):
+        surfaces = tuple(s.continued(source, config.surface) for s in surfaces)
     apart = np.empty((0, 2), dtype=np.int32)
     if given is not None:
         labels = given
     elif isinstance(source, View):
-        image, apart = segment(source, surface, config.segmentation, config.cloud, config.fit, rng)
+        image, apart = _segment_all(source, surfaces, config, rng)
         labels = image.ravel()[pixels]
     else:
-        labels = segment_cloud(cloud, surface, config.segmentation)
+        labels = segment_cloud(cloud, surfaces[0], config.segmentation)
     reach = config.surface.tolerance
-    on_surface = (labels == 0) & surface.over(cloud.points_world, -reach, reach, reach)
-    labels = np.where(on_surface, np.int32(SUPPORT_LABEL), labels)
+    for k, surface in enumerate(surfaces):
+        on_surface = (labels == 0) & surface.over(cloud.points_world, -reach, reach, reach)
+        labels = np.where(on_surface, np.int32(SUPPORT_LABEL - k), labels)
     view = source if isinstance(source, View) else None
-    return Observation(view, replace(cloud, labels=labels), pixels, surface, apart)
+    return Observation(view, replace(cloud, labels=labels), pixels, surfaces, apart)
+
+
+def _segment_all(
+    view: View, surfaces: Sequence[SupportSurface], config: Config, rng: np.random.Generator
+) -> tuple[Labels, Pairs]:
+    """Cut a view into the segments on all surfaces; the result is that of `segment`."""
+    reach = min(config.voxels.extent[:2]) / 2.0
+    foregrounds = find_foreground(view, surfaces, config.segmentation, reach)
+    image, pairs = np.zeros(view.depth.shape, dtype=np.int32), [np.empty((0, 2), dtype=np.int32)]
+    for k, (surface, own) in enumerate(zip(surfaces, foregrounds, strict=True)):
+        others = [f for n, f in enumerate(foregrounds) if n != k]
+        elsewhere = np.logical_or.reduce(others) if others else np.zeros_like(own)
+        part, apart = segment(
+            view, surface, own, elsewhere, config.segmentation, config.cloud, config.fit, rng
+        )
+        rows = np.flatnonzero(part)
+        row, column = np.divmod(rows, part.shape[1])
+        rays = np.stack([column, row, np.ones(len(rows))], axis=-1) @ np.linalg.inv(view.K).T
+        points = transforms.transform(view.pose, view.depth.ravel()[rows, None] * rays)
+        names = np.arange(part.max(initial=0))
+        furniture = find_furniture(
+            points, part.ravel()[rows] - 1, np.full(len(names), k), surfaces, config.segmentation, names < 0
+        )
+        part = np.where(np.append(False, furniture)[part], 0, part)
+        number = image.max()
+        image = np.where((part > 0) & (image == 0), part + number, image)
+        pairs.append(apart + number)
+    return image, np.concatenate(pairs).astype(np.int32)
 
 
 def _with_whole_masks(view: View, jump: float) -> View:
@@ -159,7 +203,7 @@ def _with_whole_masks(view: View, jump: float) -> View:
     inverse_depth = np.divide(1.0, view.depth, out=np.zeros(view.depth.shape), where=view.valid)
     shown = np.flatnonzero(labels > 0)
     owner = labels.ravel()[shown]
-    body = _bodies(labels, inverse_depth, jump).ravel()[shown]
+    body = find_bodies(labels, inverse_depth, jump).ravel()[shown]
     sizes = np.bincount(body, minlength=1)
     largest = np.zeros(int(labels.max()) + 1)
     first = np.flatnonzero(sizes)
@@ -167,34 +211,6 @@ def _with_whole_masks(view: View, jump: float) -> View:
     whole = np.zeros(labels.size, dtype=labels.dtype)
     whole[shown] = np.where(sizes[body] >= WHOLE * largest[owner], owner, 0)
     return replace(view, labels=whole.reshape(labels.shape))
-
-
-@kernel
-def _bodies(labels, inverse_depth, jump):  # type: ignore[no-untyped-def]
-    """The first pixel (H, W), counted by rows, of the surface of one label (H, W) that each pixel is on.
-
-    Neighbours of one label are on one surface where 1/z (H, W) differs by no more than a jump [1/m].
-    """
-    height, width = labels.shape
-    first = np.arange(height * width)
-    for row, column in np.ndindex(height, width):
-        if labels[row, column] <= 0:
-            continue
-        for r, c in ((row - 1, column), (row, column - 1)):
-            if r < 0 or c < 0 or labels[r, c] != labels[row, column]:
-                continue
-            if abs(inverse_depth[r, c] - inverse_depth[row, column]) <= jump:
-                one, other = r * width + c, row * width + column
-                while first[one] != one:
-                    first[one] = first[first[one]]
-                    one = first[one]
-                while first[other] != other:
-                    first[other] = first[first[other]]
-                    other = first[other]
-                first[max(one, other)] = min(one, other)
-    for here in range(height * width):
-        first[here] = first[first[here]]
-    return first.reshape(height, width)
 
 
 def label_image(observation: Observation, source: View | Cloud) -> NDArray[np.int32]:
@@ -216,23 +232,14 @@ def thinned(source: View | Cloud, config: CloudConfig) -> View | Cloud:
 
 
 def _points(
-    source: View | Cloud, config: Config, known: SupportSurface | None = None
+    source: View | Cloud, config: Config, known: Sequence[SupportSurface] = ()
 ) -> tuple[Cloud, NDArray[np.intp]]:
-    """Oriented points of a view, and their pixels; for a cloud, all its points.
-
-    Unlabelled points further below the known support surface than its search range are left out.
-    """
+    """Oriented points of a view, and their pixels; for a cloud, all its points."""
     if isinstance(source, Cloud):
         if len(source) == 0:
             raise PerceptionError(f"{source.name}: has no points")
         return source, np.arange(len(source), dtype=np.intp)
-    among = None
-    if known is not None:
-        among = known.pixels_over(source, -config.surface.search, np.inf)
-        if source.labels is not None:
-            among |= source.labels > 0
-        among = among if among.any() else None
-    points, normals, pixels = oriented_points(source, config.cloud, among=among)
+    points, normals, pixels = oriented_points(source, config.cloud)
     if len(points) == 0:
         raise PerceptionError(f"{source.name}: {_why_nothing(source, config.cloud)}")
     rgb = None if source.rgb is None else np.take(source.rgb.reshape(-1, 3), pixels, axis=0)
@@ -272,34 +279,37 @@ def level_transform(
     """
     source = thinned(source, config.cloud)
     cloud, pixels = _points(source, config)
+    pose = np.eye(4) if isinstance(source, View) else None
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     if given is not None:
-        given = _without_table(cloud, given, None, None, config, rng)
-    surface = _surface(cloud, given, None, None, config, rng)
+        given = _without_table(cloud, given, (), None, config, rng, pose)
+    surface = _find_surfaces(cloud, given, (), None, config, rng, pose)[0]
     return transforms.level_world(surface.normal_world, surface.point_world)
 
 
 def _without_table(
     cloud: Cloud,
     given: NDArray[np.int32],
-    known: SupportSurface | None,
+    known: Sequence[SupportSurface],
     up: Array | None,
     config: Config,
     rng: np.random.Generator,
+    T_world_camera: Array | None,
 ) -> NDArray[np.int32]:
     """Labels (N,) without that of the table, if its points have one, as segmenters of whole images give it.
 
-    In a first view, labels are asked only if no other points show a table, or only a floor a storey lower.
+    In a first view, labels are asked only if no other points show a table, or only a floor far below them.
     """
-    surface, apart = known, copy.deepcopy(rng)  # The same view without that label gives the same scene.
-    if known is None:
+    surface = known[0] if known else None
+    apart = copy.deepcopy(rng)  # The same view without that label gives the same scene.
+    if not known:
         with suppress(NoSurfaceError):
-            found = _surface(cloud, given, None, up, config, apart)
+            found = _find_surfaces(cloud, given, (), up, config, apart, T_world_camera)[0]
             heights = found.height(cloud.points_world[given > 0])
-            if np.count_nonzero(heights > config.surface.storey) < config.surface.min_points:
+            if np.count_nonzero(heights > config.segmentation.max_height) < config.surface.min_points:
                 return given
         with suppress(NoSurfaceError):
-            surface = _surface(cloud, None, None, up, config, apart)
+            surface = _find_surfaces(cloud, None, (), up, config, apart, T_world_camera)[0]
     if surface is None:
         return given
     reach = config.surface.tolerance
@@ -315,39 +325,31 @@ def _without_table(
     return np.where(given == label, np.int32(0), given)
 
 
-def _surface(
+def _find_surfaces(
     cloud: Cloud,
     given: NDArray[np.int32] | None,
-    known: SupportSurface | None,
+    known: Sequence[SupportSurface],
     up: Array | None,
     config: Config,
     rng: np.random.Generator,
-    T_world_camera: Array | None = None,
-) -> SupportSurface:
-    """Find the support surface in points without a labelled object: near the known one, or anywhere."""
+    T_world_camera: Array | None,
+) -> tuple[SupportSurface, ...]:
+    """Find the support surfaces in points without a labelled object."""
     loose = np.ones(len(cloud), dtype=bool) if given is None else given == 0
-    if known is None and not loose.any():
+    if not known and not loose.any():
         raise NoSurfaceError(
             f"{cloud.name}: every point has the label of an object, and none is left for the table; give the "
             "table label 0 (for a cloud, try --label-divisor), or use --segmentation auto"
         )
-    if known is not None:
-        loose &= np.abs(known.height(cloud.points_world)) < config.surface.search
-    # Spread evenly, 20,000 points give its height to 0.1 mm. Once it is known, a quarter is enough: as many
-    # of a first view's are the table's, the rest is floor.
-    index, (count, planes) = np.flatnonzero(loose), (20_000, 6) if known is None else (5_000, 1)
-    some = cloud.select(index[:: max(1, len(index) // count)])
+    # Spread evenly, 20,000 points give its height to 0.1 mm.
+    index = np.flatnonzero(loose)
+    some = cloud.select(index[:: max(1, len(index) // 20_000)])
+    points, normals = some.points_world, some.normals_world
     try:
-        return find_support_surface(
-            some.points_world,
-            some.normals_world,
-            up,
-            config.surface,
-            rng,
-            planes,
-            T_world_camera=T_world_camera,
+        return tuple(
+            find_support_surfaces(
+                points, normals, up, config.surface, rng, known=known, T_world_camera=T_world_camera
+            )
         )
     except NoSurfaceError as error:
-        if known is not None:
-            return known
         raise NoSurfaceError(f"{cloud.name}: {error}") from None

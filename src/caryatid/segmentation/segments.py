@@ -41,16 +41,20 @@ PLAIN = 0.02
 def segment(
     view: View,
     surface: SupportSurface,
+    foreground: Mask,
+    elsewhere: Mask,
     config: SegmentationConfig,
     clouds: CloudConfig,
     fit_config: FitConfig,
     rng: np.random.Generator,
 ) -> tuple[Labels, Pairs]:
-    """Cut one view into the segments on the support surface.
+    """Cut one view into the segments on a support surface.
 
     Args:
         view: The view, which has a pose.
         surface: The support surface.
+        foreground: Its pixels (H, W) of what may stand on it.
+        elsewhere: Its pixels (H, W) of what may stand on other surfaces.
         config: Sampling, sizes and angles.
         clouds: Working range and normals.
         fit_config: Limits of the shapes that parts of one object are merged by.
@@ -61,8 +65,7 @@ def segment(
         between them, which are two bodies whatever shape they make together.
     """
     labels, apart = np.zeros(view.depth.shape, dtype=np.int32), np.empty((0, 2), dtype=np.int32)
-    foreground = surface.pixels_over(view, config.clearance, config.max_height, config.margin)
-    foreground &= (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
+    foreground = foreground & (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
     if not foreground[:: config.stride, :: config.stride].any():
         return labels, apart
     samples = take_samples(view, foreground, surface, config, clouds)
@@ -77,7 +80,7 @@ def segment(
     wide = wide_parts(samples.image(part))
     # Something beside the surface or in the room behind is not an object on it; nor is a wall at its edge,
     # which begins where the readings of the surface end. Of a board that a weight holds, most may be outside.
-    over = surface.pixels_over(view, 0.0, np.inf, -config.clearance)[samples.grid][samples.places]
+    over = surface.pixels_over(view, 0.0, np.inf, -surface.region.size)[samples.grid][samples.places]
     proper = wide[part]
     part = _with_share(np.where(proper, part, 0), over, 0.2)
     uncut, width = samples.image(part), GAP // config.stride
@@ -108,7 +111,7 @@ def segment(
     bottom[~low[around] | (labels[around] > 0)] = 0
     labels[around] += bottom
     # What the margin cuts off goes on: a board may hang over the edge by more.
-    beyond = surface.pixels_over(view, config.clearance, config.max_height) & ~foreground
+    beyond = surface.pixels_over(view, config.clearance, config.max_height) & ~foreground & ~elsewhere
     beyond &= (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
     _spread_labels(labels, np.flatnonzero(beyond), view.depth, jump, max(labels.shape))
     return labels, apart

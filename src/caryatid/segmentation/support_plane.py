@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from caryatid.config import SurfaceConfig
 from caryatid.errors import NoSurfaceError
-from caryatid.geometry import transforms
+from caryatid.geometry import polygons, transforms
 from caryatid.geometry.polygons import hull
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, for_each, kernel
-from caryatid.sensing.views import View
+from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, View
 
 Mask = NDArray[np.bool_]
 
+CELL = 0.03
+"""Edge of the cells in which parts of a plane are told apart [m]; wider than the spacing of points at 3 m."""
+SHOWN = 0.5
+"""Minimum share of another surface than the main one that is seen [1]: noise beside a plane is scattered."""
+BESIDE = 0.05
+"""How far outside its outline the middle of an object may be that stands on a surface [m]."""
+MOST_PLANES = 6
+"""Maximum number of planes, largest first, among which surfaces are found [1]."""
+MIDDLE = 5.0
+"""Angle from the optical axis at which what an image shows counts 0.6 of what its middle does [deg]: a fifth
+of the way to its border."""
 GL = np.diag([1.0, -1.0, -1.0])
 """Axes (3, 3) of OpenCV's camera frame in OpenGL's."""
 BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -39,59 +53,175 @@ Z_UP = "rotate the world so that its z axis points up (on the command line: --le
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Region:
+    """Squares of a grid along the world's x and y axes.
+
+    Attributes:
+        corner: Numbers (2,) of the first square along x and y; square 0 begins at the origin.
+        squares: Which squares (X, Y) belong to it.
+        size: Edge of a square [m].
+    """
+
+    corner: NDArray[np.intp]
+    squares: Mask
+    size: float
+
+    @classmethod
+    def around(cls, points_world: Array, size: float) -> Region:
+        """The squares that hold points (N, 3) [m], and single ones between them."""
+        index = np.floor(points_world[:, :2] / size).astype(np.intp)
+        low, high = index.min(axis=0) - 1, index.max(axis=0) + 2
+        squares = np.zeros(high - low, dtype=np.bool_)
+        squares[tuple((index - low).T)] = True
+        # A point that registration moved leaves its square.
+        return cls(low, ndimage.binary_closing(squares, np.ones((3, 3))), size)
+
+    @property
+    def area(self) -> float:
+        """Area [m²]."""
+        return float(np.count_nonzero(self.squares)) * self.size**2
+
+    def holds(self, places: Array) -> Mask:
+        """Whether places (N, 2) [m], or the x and y of points (N, 3), are in it."""
+        index = np.floor(places[:, :2] / self.size).astype(np.intp) - self.corner
+        inside = ((index >= 0) & (index < self.squares.shape)).all(axis=1)
+        held = np.zeros(len(index), dtype=np.bool_)
+        held[inside] = self.squares[tuple(index[inside].T)]
+        return held
+
+    def places(self) -> Array:
+        """Centres (N, 2) of its squares [m]."""
+        return np.asarray(self.size * (np.argwhere(self.squares) + self.corner + 0.5), dtype=np.float64)
+
+    def centres(self) -> Array:
+        """Centres (X, Y, 2) of all squares of the grid [m]."""
+        index = np.moveaxis(np.indices(self.squares.shape), 0, -1) + self.corner
+        return np.asarray(self.size * (index + 0.5), dtype=np.float64)
+
+    def grown(self, margin: float) -> Region:
+        """The region and the squares within a margin [m] of it; if negative, without a border as wide."""
+        if margin < 0.0:
+            depth = ndimage.distance_transform_edt(np.pad(self.squares, 1))[1:-1, 1:-1]
+            return replace(self, squares=depth * self.size > self.size / 2.0 - margin)
+        border = int(np.ceil(margin / self.size))
+        squares = np.pad(self.squares, border)
+        if border:
+            squares = ndimage.distance_transform_edt(~squares) <= margin / self.size
+        return Region(self.corner - border, squares, self.size)
+
+    def joined(self, other: Region) -> Region:
+        """The squares of either region."""
+        low = np.minimum(self.corner, other.corner)
+        high = np.maximum(self.corner + self.squares.shape, other.corner + other.squares.shape)
+        squares = np.zeros(high - low, dtype=np.bool_)
+        for part in (self, other):
+            x, y = part.corner - low
+            squares[x : x + part.squares.shape[0], y : y + part.squares.shape[1]] |= part.squares
+        return Region(low, squares, self.size)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class SupportSurface:
-    """The table top.
+    """A level surface that carries objects, such as a table top.
 
     Attributes:
         normal_world: Unit normal (3,), upwards.
         point_world: Centroid of the inliers, moved onto the plane (3,) [m].
         outline_world: Convex hull (M, 3) of the inliers on the plane [m], counter-clockwise seen from above.
         shape: Thin box whose top face is the smallest rectangle around the outline; its z is the normal.
+        region: Where it was seen, and where something in front of it hides what goes on there.
     """
 
     normal_world: Array
     point_world: Array
     outline_world: Array
     shape: Box
+    region: Region
+
+    @property
+    def width(self) -> float:
+        """Shorter side of the smallest rectangle around it [m]."""
+        return float(self.shape.extents[:2].min())
+
+    @property
+    def outline_area(self) -> float:
+        """Area within its outline, in plan [m²]."""
+        return polygons.area(np.ascontiguousarray(self.outline_world[:, :2]))
 
     def height(self, points_world: Array) -> Array:
         """Signed height (...,) [m] of points (..., 3) over the surface."""
         return (points_world - self.point_world) @ self.normal_world
 
     def over(self, points_world: Array, low: float, high: float, margin: float) -> Mask:
-        """Which points (N, 3) [m] are over the outline, or no further than a margin [m] outside its sides.
+        """Which points (N, 3) [m] are over the region, or no further than a margin [m] outside its sides.
 
         Their height is between low and high [m].
         """
-        return _points_over(np.ascontiguousarray(points_world), self._planes(margin), low, high)
+        height = self.height(points_world)
+        return (low < height) & (height < high) & self.region.grown(margin).holds(points_world)
 
     def pixels_over(self, view: View, low: float, high: float, margin: float = np.inf) -> Mask:
-        """Which pixels (H, W) of a view show something between two heights [m] over the surface.
+        """Which pixels (H, W) of a view, which has a pose, show something between two heights [m] over it.
 
-        The margin is as for `over`; if it is infinite, anything above or below counts. If the view has no
-        pose, the surface is in the camera frame.
+        The margin is as for `over`; if it is infinite, anything above or below counts.
         """
-        surface = self if view.T_world_camera is None else self.moved(transforms.invert(view.T_world_camera))
         x, y = ((np.arange(n) - view.K[k, 2]) / view.K[k, k] for k, n in enumerate(view.depth.shape[::-1]))
-        return _pixels_over(view.depth, x, y, surface._planes(margin), low, high)
+        T, everywhere = np.ascontiguousarray(view.pose), margin == np.inf
+        own = self.region if everywhere else self.region.grown(margin)
+        grid = own.squares, own.corner, own.size
+        return _pixels_over(view.depth, x, y, T, self._plane, everywhere, *grid, low, high)
 
-    def _planes(self, margin: float) -> Array:
-        """Planes n·p + d (M, 4): the surface's own, and those beyond which points are too far outside."""
-        up, corners = self.normal_world, self.outline_world
-        own = np.append(up, -up @ self.point_world)[None]
-        if margin == np.inf:
-            return own
-        outward = np.cross(transforms.unit(np.roll(corners, -1, axis=0) - corners), up)
-        offsets = -np.einsum("ij,ij->i", outward, corners) - margin
-        return np.concatenate([own, np.column_stack([outward, offsets])])
+    @property
+    def _plane(self) -> Array:
+        """Its plane n·p + d (4,)."""
+        return np.append(self.normal_world, -self.normal_world @ self.point_world)
+
+    def continued(self, view: View, config: SurfaceConfig) -> SupportSurface:
+        """Return the surface with the region that a view leaves open.
+
+        It goes on as far as a gap of the configuration where the view shows the surface, or something nearer
+        in its place. Places without a reading belong to it if they are between those that do.
+        """
+        wide = self.region.grown(config.gap)
+        if self.height(view.pose[:3, 3]) <= 0.0:
+            return self
+        feet = wide.centres()
+        n, p = self.normal_world, self.point_world
+        z = p[2] - ((feet - p[:2]) @ n[:2]) / n[2]
+        points = transforms.transform(transforms.invert(view.pose), np.dstack([feet, z]).reshape(-1, 3))
+        ahead = points[:, 2] > config.tolerance
+        pixels = (points @ view.K.T)[:, :2] / np.where(ahead, points[:, 2], 1.0)[:, None]
+        column, row = np.rint(pixels).astype(np.intp).T
+        height, width = view.depth.shape
+        inside = np.flatnonzero(ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height))
+        z = view.depth[row[inside], column[inside]].astype(np.float64)
+        # The line of sight to a square comes from above: a reading below it is seen past the surface.
+        share = np.divide(z, points[inside, 2])
+        eye = float(self.height(view.pose[:3, 3]))
+        through, hidden = np.zeros((2, *wide.squares.shape), dtype=np.bool_)
+        through.ravel()[inside] = (z > 0.0) & (eye * (1.0 - share) < -config.tolerance)
+        hidden.ravel()[inside] = (z > 0.0) & (eye * (1.0 - share) > -config.tolerance)
+        seen = np.pad(self.region.squares, int(np.ceil(config.gap / wide.size)))
+        part, _ = ndimage.label(seen | (hidden & wide.squares))
+        main = np.argmax(np.bincount(part[seen]))
+        seen &= part == main
+        corners = hull(np.argwhere(seen).astype(np.float64))
+        whole = shapely.contains_xy(shapely.Polygon(corners), *np.indices(seen.shape)) & ~through
+        return replace(self, region=replace(wide, squares=(part == main) | whole))
+
+    def continues(self, other: SupportSurface, config: SurfaceConfig) -> bool:
+        """Whether it is a part of another surface, which noise or a tilt sets off."""
+        near = other.region.grown(config.gap).holds(self.region.places())
+        return bool(near.any() and abs(other.height(self.point_world)) < config.search)
 
     def moved(self, T: Array) -> SupportSurface:
-        """Return the surface moved by a rigid transform (4, 4) of the world."""
-        return SupportSurface(
-            transforms.rotate(T, self.normal_world),
-            transforms.transform(T, self.point_world),
-            transforms.transform(T, self.outline_world),
-            self.shape.moved(T),
+        """Return the surface moved by a rigid transform (4, 4) of the world, by less than a square."""
+        return replace(
+            self,
+            normal_world=transforms.rotate(T, self.normal_world),
+            point_world=transforms.transform(T, self.point_world),
+            outline_world=transforms.transform(T, self.outline_world),
+            shape=self.shape.moved(T),
         )
 
 
@@ -166,46 +296,69 @@ class _Scene(NamedTuple):
             offset = float(normal @ centre)
         if up is not None and normal @ up < np.cos(np.radians(config.max_tilt)):
             return None
-        inliers, area = self._main_part(normal, inliers)
+        inliers, area = self._main_part(normal, inliers, config.gap)
         return _Plane(normal, offset, inliers, area) if inliers.sum() >= config.min_points else None
 
-    def _main_part(self, normal: Array, inliers: Mask) -> tuple[Mask, float]:
+    def parts(self, plane: _Plane, gap: float) -> list[_Plane]:
+        """The parts of a plane that are further apart than a gap [m], largest first."""
+        parts, left = list[_Plane](), plane.inliers
+        while np.count_nonzero(left) >= self.config.min_points:
+            inliers, area = self._main_part(plane.normal, left, gap)
+            parts.append(_Plane(plane.normal, plane.offset, inliers, area))
+            left = left & ~inliers
+        return parts
+
+    def _main_part(self, normal: Array, inliers: Mask, gap: float) -> tuple[Mask, float]:
         """Keep the largest part of a plane that is connected across gaps; say how much of it is seen [m²]."""
         index = np.flatnonzero(inliers)
         flat = _basis(normal) @ np.take(self.points, index, axis=0).T
-        # Cells are wider than the points' spacing at 3 m; if a cloud is not in metres, there are no more
-        # than memory holds.
-        cell = max(0.03, float((flat.max(axis=1) - flat.min(axis=1)).max()) / 1000.0)
+        # If a cloud is not in metres, there are no more cells than memory holds.
+        cell = max(CELL, float((flat.max(axis=1) - flat.min(axis=1)).max()) / 1000.0)
         cells = np.floor(flat / cell).astype(np.intp)
         cells -= cells.min(axis=1, keepdims=True)
         size = cells.max(axis=1) + 1
         owner = cells[0] * size[1] + cells[1]
         count = np.bincount(owner, minlength=int(size.prod())).reshape(size)
-        reach = int(min(np.ceil(self.config.gap / cell / 2.0), size.max()))
-        near = ndimage.distance_transform_edt(np.pad(count == 0, reach))[reach:-reach, reach:-reach] <= reach
-        part, _ = ndimage.label(near)
+        reach = int(min(np.ceil(gap / cell / 2.0), size.max()))
+        away = ndimage.distance_transform_edt(np.pad(count == 0, reach))
+        near = away[reach : reach + size[0], reach : reach + size[1]] <= reach
+        part, _ = ndimage.label(near, np.ones((3, 3)))
         main = int(np.argmax(np.bincount(part.ravel(), weights=count.ravel())))
         kept = np.zeros_like(inliers)
         kept[index[part.ravel()[owner] == main]] = True
         return kept, float(np.count_nonzero((count > 0) & (part == main))) * cell**2
 
 
-def find_support_surface(
+def find_surface_below(surfaces: Sequence[SupportSurface], points_world: Array) -> NDArray[np.intp]:
+    """Number (N,) of the highest surface below each point (N, 3) [m]; 0, the main one, if there is none.
+
+    What stands on a surface hides it from view, so that all within its outline counts, and a little more.
+    """
+    least, below = np.full(len(points_world), np.inf), np.zeros(len(points_world), dtype=np.intp)
+    for k, surface in enumerate(surfaces):
+        height = surface.height(points_world)
+        outline = shapely.Polygon(surface.outline_world[:, :2]).buffer(BESIDE)
+        nearer = (height > 0.0) & (height < least) & shapely.contains_xy(outline, points_world[:, :2])
+        least[nearer], below[nearer] = height[nearer], k
+    return below
+
+
+def find_support_surfaces(
     cloud_points: Array,
     normals: Array,
     up: Array | None,
     config: SurfaceConfig,
     rng: np.random.Generator,
-    max_planes: int = 6,
     *,
+    known: Sequence[SupportSurface] = (),
     T_world_camera: Array | None = None,
-) -> SupportSurface:
-    """Find the table among the planes of a scene.
+) -> list[SupportSurface]:
+    """Find the surfaces that may carry objects among the planes of a scene, the main one first.
 
-    The planes across `up` are taken out one by one, largest first. Those with a table-sized plane a storey
-    above them are floors; of the rest, the one with most points, at which the camera looks, is the table.
-    Without `up`, the largest plane that faces the camera and has the rest of the scene in front of it gives
-    the direction.
+    The planes across `up` are taken out one by one, largest first; parts of one that nothing connects are
+    several. The camera looks at the main one: of those as large as furniture, it is the one that the middle
+    of the image shows most of, with what stands on it. Others must be as large as that. Without `up`, the
+    largest plane that faces the camera and has the rest of the scene in front of it gives the direction.
 
     Args:
         cloud_points: (N, 3) [m]; in the camera frame if `up` is None.
@@ -213,11 +366,11 @@ def find_support_surface(
         up: Upward direction (3,), or None if the camera's pose is unknown.
         config: Tolerances and sizes.
         rng: Draws the hypotheses.
-        max_planes: Maximum number of horizontal planes, largest first, among which the table is chosen.
-        T_world_camera: Reported camera pose (4, 4), with which an error says what is wrong with it; or None.
+        known: The surfaces known so far, which stay the first ones, in this order.
+        T_world_camera: Reported camera pose (4, 4) in the frame of the points, or None for a cloud.
 
     Raises:
-        NoSurfaceError: No plane has enough points.
+        NoSurfaceError: No surface is known, and no plane has enough points.
     """
     points, normals = np.asarray(cloud_points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
     scene = _Scene(points, normals, up, config)
@@ -228,16 +381,49 @@ def find_support_surface(
         # The camera may be upside down.
         elif plane := _Scene(points * turned, normals * turned, None, config).largest_plane(everywhere, rng):
             up = plane.normal * turned
-    planes: list[_Plane] = []
-    if up is not None:
-        up = transforms.unit(up)
-        scene, left = scene._replace(up=up), normals @ up > np.cos(np.radians(config.max_deviation))
-        while len(planes) < max_planes and (plane := scene.largest_plane(left, rng)):
-            planes.append(plane)
-            left = left & (np.abs(points @ plane.normal - plane.offset) > 2.0 * config.tolerance)
-    if up is None or not planes:
+    if up is None:
         raise NoSurfaceError(f"no support surface: {_tried(scene, rng, T_world_camera)}")
-    return _surface(points, _choose_table(planes, up, config))
+    up = transforms.unit(up)
+    scene, left = scene._replace(up=up), normals @ up > np.cos(np.radians(config.max_deviation))
+    surfaces = list[SupportSurface]()
+    for surface in known:
+        height, wide = surface.height(points), surface.region.grown(config.gap)
+        near = left & (np.abs(height) < config.search) & wide.holds(points)
+        plane = scene.largest_plane(_some(near, 5_000), rng)
+        found = surface if plane is None else _surface(points, plane, config, surface.outline_world)
+        surfaces.append(replace(found, region=found.region.joined(surface.region)))
+        left &= ~near
+    planes: list[_Plane] = []
+    left = _some(left, 5_000 if known else len(points))
+    while len(planes) < MOST_PLANES and (plane := scene.largest_plane(left, rng)):
+        planes.append(plane)
+        left = left & (np.abs(points @ plane.normal - plane.offset) > 2.0 * config.tolerance)
+    if not known and not planes:
+        raise NoSurfaceError(f"no support surface: {_tried(scene, rng, T_world_camera)}")
+    if not known:
+        weights = np.ones(len(points))
+        if T_world_camera is not None:
+            rays = transforms.unit(points - T_world_camera[:3, 3])
+            away = np.degrees(np.arccos(np.clip(rays @ T_world_camera[:3, 2], -1.0, 1.0)))
+            weights = np.exp(-0.5 * (away / MIDDLE) ** 2)
+        main = _choose_table(planes, points, weights, config)
+        surfaces.append(_surface(points, planes.pop(main), config))
+    for plane in (part for plane in planes for part in scene.parts(plane, 0.0)):
+        if len(surfaces) == SUPPORT_LABEL - MAX_LABEL:
+            break
+        with suppress(NoSurfaceError):  # The points may lie on a line.
+            surface = _surface(points, plane, config)
+            alone = not any(surface.continues(other, config) for other in surfaces)
+            if alone and surface.width >= config.min_width and plane.area > SHOWN * surface.outline_area:
+                surfaces.append(surface)
+    return surfaces
+
+
+def _some(which: Mask, count: int) -> Mask:
+    """Evenly spread ones among some points (N,), at least `count` of them if there are as many."""
+    index, some = np.flatnonzero(which), np.zeros_like(which)
+    some[index[:: max(1, len(index) // count)]] = True
+    return some
 
 
 def _tried(scene: _Scene, rng: np.random.Generator, T_world_camera: Array | None) -> str:
@@ -281,30 +467,38 @@ def refitted(
     normal, everywhere = surface.normal_world, np.ones(len(points), dtype=bool)
     scene = _Scene(points, normals, up, config)
     plane = scene.refined(everywhere, normal, float(normal @ surface.point_world))
-    return None if plane is None else _surface(points, plane)
+    return None if plane is None else _surface(points, plane, config)
 
 
-def _choose_table(planes: list[_Plane], up: Array, config: SurfaceConfig) -> _Plane:
-    """The plane with most points among those that have no table a storey above them."""
-    # Where each cuts the line along `up` through the origin. A shelf behind has too few points for a table.
-    heights = [plane.offset / (plane.normal @ up) for plane in planes]
-    counts = [np.count_nonzero(plane.inliers) for plane in planes]
-    sizeable = [plane.area >= config.min_area for plane in planes]
-    tables = np.argwhere(sizeable)[:, 0]
+def _choose_table(planes: list[_Plane], points: Array, weights: Array, config: SurfaceConfig) -> int:
+    """The number of the plane that most points (N, 3), by their weights (N,), are on or over.
 
-    def is_floor(k: int) -> bool:
-        return any(heights[j] > heights[k] + config.storey and counts[j] >= 0.05 * counts[k] for j in tables)
+    A point belongs to the highest plane below it. Planes as large as furniture come first.
+    """
+    heights = np.full((len(planes), len(points)), np.inf)
+    for k, plane in enumerate(planes):
+        flat = points @ _basis(plane.normal).T
+        own = Region.around(np.compress(plane.inliers, flat, axis=0), CELL).grown(2.0 * CELL).holds(flat)
+        height = points @ plane.normal - plane.offset
+        heights[k] = np.where(own & (height > -config.tolerance), height, np.inf)
+    above = np.isfinite(heights).any(axis=0)
+    shown = np.bincount(heights[:, above].argmin(axis=0), weights[above], minlength=len(planes))
+    return max(range(len(planes)), key=lambda k: (planes[k].area >= config.min_width**2, shown[k]))
 
-    return planes[max(range(len(planes)), key=lambda k: (not is_floor(k), sizeable[k], counts[k]))]
 
+def _surface(
+    points: Array, plane: _Plane, config: SurfaceConfig, outline: Array | None = None
+) -> SupportSurface:
+    """The surface of a plane: the hull of its points, and a box under the smallest rectangle around that.
 
-def _surface(points: Array, plane: _Plane) -> SupportSurface:
-    """The surface of a plane: the hull of its points, and a box under the smallest rectangle around that."""
+    The hull is also around the outline (M, 3) [m] known so far.
+    """
     on_plane = np.compress(plane.inliers, points, axis=0)
     centroid = np.array([x.mean() for x in on_plane.T])
     centroid = centroid - (plane.normal @ centroid - plane.offset) * plane.normal
     basis, thickness = _basis(plane.normal), 0.04
-    corners = hull(np.ascontiguousarray((on_plane - centroid) @ basis.T))
+    around = on_plane if outline is None else np.concatenate([on_plane, outline])
+    corners = hull(np.ascontiguousarray((around - centroid) @ basis.T))
     if len(corners) < 3:
         raise NoSurfaceError("no support surface: the points of the plane are collinear")
     edges = transforms.unit(np.roll(corners, -1, axis=0) - corners)
@@ -317,7 +511,10 @@ def _surface(points: Array, plane: _Plane) -> SupportSurface:
     R = np.stack([x @ basis, y @ basis, normal], axis=1)
     centre = centroid + (middle[0] * x + middle[1] * y) @ basis - thickness / 2.0 * normal
     box = Box(transforms.rigid(R, centre), np.array([*sizes[:, best], thickness]))
-    return SupportSurface(plane.normal, centroid, centroid + corners @ basis, box)
+    # If a cloud is not in metres, there are no more squares than memory holds.
+    size = max(config.spacing, float(np.ptp(on_plane[:, :2], axis=0).max()) / 1000.0)
+    region = Region.around(on_plane, size)
+    return SupportSurface(plane.normal, centroid, centroid + corners @ basis, box, region)
 
 
 def _basis(normal: Array) -> Array:
@@ -348,30 +545,21 @@ def _score_planes(share, data):  # type: ignore[no-untyped-def]
             gains[k] -= penalty if signed < -3.0 * tolerance else 0.0
 
 
-@kernel(inline="always")
-def _is_over(planes, x, y, z, low, high):  # type: ignore[no-untyped-def]
-    """Whether a point lies between two heights over the first plane, and on the inner side of the others."""
-    over = low < planes[0, 0] * x + planes[0, 1] * y + planes[0, 2] * z + planes[0, 3] < high
-    k = 1
-    while over and k < len(planes):
-        over = planes[k, 0] * x + planes[k, 1] * y + planes[k, 2] * z + planes[k, 3] <= 0.0
-        k += 1
-    return over
-
-
 @kernel
-def _points_over(points, planes, low, high):  # type: ignore[no-untyped-def]
-    over = np.empty(len(points), np.bool_)
-    for i in range(len(points)):
-        over[i] = _is_over(planes, points[i, 0], points[i, 1], points[i, 2], low, high)
-    return over
-
-
-@kernel
-def _pixels_over(depth, x, y, planes, low, high):  # type: ignore[no-untyped-def]
+def _pixels_over(depth, x, y, T, plane, everywhere, squares, corner, size, low, high):  # type: ignore[no-untyped-def]
     over = np.zeros(depth.shape, np.bool_)
+    a = plane[0] * T[0, 0] + plane[1] * T[1, 0] + plane[2] * T[2, 0]
+    b = plane[0] * T[0, 1] + plane[1] * T[1, 1] + plane[2] * T[2, 1]
+    c = plane[0] * T[0, 2] + plane[1] * T[1, 2] + plane[2] * T[2, 2]
+    d = plane[0] * T[0, 3] + plane[1] * T[1, 3] + plane[2] * T[2, 3] + plane[3]
     for row in range(len(y)):
         for col in range(len(x)):
             z = float(depth[row, col])
-            over[row, col] = z > 0.0 and _is_over(planes, x[col] * z, y[row] * z, z, low, high)
+            if z <= 0.0 or not low < (a * x[col] + b * y[row] + c) * z + d < high:
+                continue
+            u = (T[0, 0] * x[col] + T[0, 1] * y[row] + T[0, 2]) * z + T[0, 3]
+            v = (T[1, 0] * x[col] + T[1, 1] * y[row] + T[1, 2]) * z + T[1, 3]
+            i, j = int(np.floor(u / size)) - corner[0], int(np.floor(v / size)) - corner[1]
+            inside = 0 <= i < squares.shape[0] and 0 <= j < squares.shape[1]
+            over[row, col] = everywhere or (inside and squares[i, j])
     return over

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import binary_erosion
 
 from caryatid.config import Config, SurfaceConfig
 from caryatid.errors import WrongViewError
-from caryatid.geometry import polygons
 from caryatid.geometry.transforms import Array
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
@@ -97,21 +97,20 @@ def check_masks(view: View, eye_world: Array | None, surface: SupportSurface, co
 
 def check_size(name: str, surface: SupportSurface, config: SurfaceConfig) -> None:
     """Warn of a support surface that is smaller than a table, such as the side of a box if z is not up."""
-    area = polygons.area(np.ascontiguousarray(surface.outline_world[:, :2])) / surface.normal_world[2]
-    if area < config.min_area:
+    if surface.width < config.min_width:
         remedy = "if it is not the table, show more of the table or use --level"
-        log.warning("%s: the support surface has only %.3f m²; %s", name, area, remedy)
+        log.warning("%s: the support surface is only %.2f m wide; %s", name, surface.width, remedy)
 
 
 def check_place(
-    cloud: Cloud, aligned: bool, surface: SupportSurface, voxels: VoxelMap, config: Config
+    cloud: Cloud, aligned: bool, surfaces: Sequence[SupportSurface], voxels: VoxelMap, config: Config
 ) -> None:
-    """Reject a view whose camera is below the table, or that does not overlap with earlier views.
+    """Reject a view whose camera is below all surfaces, or that does not overlap with earlier views.
 
     Args:
         cloud: Registered points of the view.
         aligned: Whether registration matched it with earlier views.
-        surface: The support surface.
+        surfaces: The support surfaces, the main one first.
         voxels: The map of earlier views.
         config: All settings.
 
@@ -125,14 +124,14 @@ def check_place(
         return WrongViewError(cloud.name, reason, f"check T_world_camera: {convention}")
 
     eye_world = cloud.viewpoint_world
-    height = 1.0 if eye_world is None else float((eye_world - surface.point_world) @ surface.normal_world)
+    height = 1.0 if eye_world is None else max(float(s.height(eye_world)) for s in surfaces)
     if height <= 0.0:
         raise refused(f"the camera would be {-height:.2f} m below the table top")
     points = cloud.points_world[:: max(1, len(cloud.points_world) // 20_000)]
     voxel = np.floor((points - voxels.origin_world) / voxels.config.size).astype(np.intp)
     within = ((voxel > 0) & (voxel < np.array(voxels.hits.shape) - 1)).all(axis=1)
     if not within.any():
-        away = np.linalg.norm(points.mean(axis=0) - surface.point_world)
+        away = np.linalg.norm(points.mean(axis=0) - surfaces[0].point_world)
         raise refused(f"none of its points are near the table, but {away:.3g} m away")
     seen = np.zeros(np.array(voxels.hits.shape) // COARSER + 1, dtype=np.bool_)
     seen[tuple(voxels.occupied // COARSER)] = True

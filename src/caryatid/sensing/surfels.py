@@ -14,7 +14,7 @@ from caryatid.config import RegistrationConfig
 from caryatid.geometry.points import quantile
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, kernel, on_threads
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud
+from caryatid.sensing.views import MAX_LABEL, Cloud
 
 MIN_COSINE = 0.9
 """Minimum cosine of the angle between normals that agree [1]."""
@@ -31,16 +31,16 @@ def surfels_of(
     normals disagree, are left out.
 
     Args:
-        cloud: Labelled points in the world; 0 = nothing that counts, 65535 = the support surface.
+        cloud: Labelled points in the world; 0 = nothing that counts, above 65519 = a support surface.
         config: Sizes of the patches.
-        same_labels: Whether labels mean the same in every view; otherwise only the support surface's does.
+        same_labels: Whether labels mean the same in every view; otherwise only a support surface's does.
 
     Returns:
         Patches (P, 8), and the side (P,) each is of: one part of the view, facing roughly one way.
     """
     assert cloud.labels is not None
     voxels, kinds, sums = _gathered(cloud.points_world, cloud.normals_world, cloud.labels, config)
-    far = kinds // 6 == SUPPORT_LABEL
+    far = kinds // 6 > MAX_LABEL
     count = sums[:, 0]
     # Rims, and sides at a grazing angle, have few readings; in coarse images all patches do.
     enough = np.full(len(far), 4.0)
@@ -57,10 +57,10 @@ def surfels_of(
     spread = (xx - x * x) * u * u + (yy - y * y) * v * v + (zz - z * z) * w * w
     across = (xy - x * y) * u * v + (xz - x * z) * u * w + (yz - y * z) * v * w
     variance = np.maximum(spread + 2.0 * across, 0.0) / count
-    far = kinds // 6 == SUPPORT_LABEL
+    far = kinds // 6 > MAX_LABEL
     edge = np.where(far, config.spacing_far, config.spacing)
     corner = np.stack([edge * ((voxels >> bits) % (2 * OFFSET) - OFFSET) for bits in (42, 21, 0)])
-    labels = kinds // 6 if same_labels else np.where(far, SUPPORT_LABEL, 1)
+    labels = kinds // 6 if same_labels else np.where(far, kinds // 6, 1)
     patches = np.column_stack([*(corner + means[:3]), u, v, w, variance, labels])
     return _flattened(patches, np.unique(kinds, return_inverse=True)[1], config)
 
@@ -111,7 +111,7 @@ def _gather(points, normals, labels, spacing, spacing_far):  # type: ignore[no-u
         label = labels[i]
         if label == 0:
             continue
-        edge = spacing_far if label == SUPPORT_LABEL else spacing
+        edge = spacing_far if label > MAX_LABEL else spacing
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         cx, cy, cz = np.floor(x / edge), np.floor(y / edge), np.floor(z / edge)
         x, y, z = x - edge * cx, y - edge * cy, z - edge * cz

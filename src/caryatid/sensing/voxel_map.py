@@ -115,12 +115,22 @@ class VoxelMap:
         hits, passes = (np.where(which, np.uint8(0), counts) for counts in (self.hits, self.passes))
         return VoxelMap(self.origin_world, hits, passes, self.config)
 
-    def closed_below(self, outline_world: Array, normal_world: Array) -> VoxelMap:
-        """Return the map with the space below a level surface free: no object is there.
+    def lowered(self, z: float) -> VoxelMap:
+        """Return the map with its lower end at least as far down as a height [m]; the new part is unknown."""
+        more = int(np.ceil((self.origin_world[2] - z) / self.config.size))
+        if more <= 0:
+            return self
+        hits, passes = (np.pad(counts, ((0, 0), (0, 0), (more, 0))) for counts in (self.hits, self.passes))
+        origin = self.origin_world - (0.0, 0.0, more * self.config.size)
+        return VoxelMap(origin, hits, passes, self.config)
+
+    def closed_below(self, outline_world: Array, normal_world: Array, depth: float) -> VoxelMap:
+        """Return the map with the space below a level surface free, to a depth [m]: no object is there.
 
         Args:
             outline_world: Corners (M, 3) [m] of the convex surface, counter-clockwise seen from above.
             normal_world: Its unit normal (3,), upwards.
+            depth: How far.
         """
         x, y, z = (origin + self.config.size * (np.arange(count) + 0.5)
                    for origin, count in zip(self.origin_world, self.hits.shape, strict=True))  # fmt: skip
@@ -128,7 +138,7 @@ class VoxelMap:
         middle, layers = outline_world.mean(axis=0), int(np.searchsorted(z, outline_world[:, 2].max()))
         across = (x[:, None] - middle[0]) * normal_world[0] + (y - middle[1]) * normal_world[1]
         heights = across[..., None] + (z[:layers] - middle[2]) * normal_world[2]
-        below = inside[..., None] & (heights < -self.config.size / 2.0)
+        below = inside[..., None] & (heights < -self.config.size / 2.0) & (heights > -depth)
         hits, passes = self.hits.copy(), self.passes.copy()
         hits[..., :layers][below], passes[..., :layers][below] = 0, 1
         return VoxelMap(self.origin_world, hits, passes, self.config)

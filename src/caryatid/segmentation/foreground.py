@@ -1,0 +1,212 @@
+"""Foreground: which pixels of a view show what may stand on which support surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from caryatid.config import SegmentationConfig
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.runtime.parallel import kernel
+from caryatid.segmentation.seams import GAP, cut_at_seams, find_seams
+from caryatid.segmentation.support_plane import Mask, SupportSurface
+from caryatid.sensing.views import View
+
+MOST = 0.8
+"""Share of a body that lies in a place, from which all of it does [1]: noise at depth edges strays."""
+PARTLY = 0.4
+"""Share of a leg or wall along the border of what it carries [1]: from inside, half of it is seen."""
+THIN = 0.03
+"""Maximum thickness of a wall, as far as it is seen [m]: a board, and the noise of its readings."""
+MIN_WALL = 0.24
+"""Minimum length of a wall along the border of the surface that it stands on [m]: an object is no wider."""
+TOUCHING = 3
+"""Minimum number of samples in which a body meets the surface that it stands on [1]."""
+
+
+def find_foreground(
+    view: View, surfaces: Sequence[SupportSurface], config: SegmentationConfig, reach: float
+) -> list[Mask]:
+    """Find the pixels of what may stand, directly or not, on each of some surfaces.
+
+    A pixel belongs to the highest surface below it. On other surfaces than the main one, objects touch the
+    surface, are within reach and wholly in the image, and no higher than objects are.
+
+    Args:
+        view: The view, which has a pose.
+        surfaces: The support surfaces, the main one first.
+        config: Sampling, margins and sizes.
+        reach: Maximum distance from the middle of the main surface, in plan [m].
+
+    Returns:
+        For each surface, which pixels (H, W).
+    """
+    low, high, margin = config.clearance, config.max_height, config.margin
+    if len(surfaces) == 1:
+        return [surfaces[0].pixels_over(view, low, high, margin)]
+    owner, level = np.zeros((2, *view.depth.shape), dtype=np.int32)
+    for k in sorted(range(len(surfaces)), key=lambda k: -surfaces[k].point_world[2]):
+        # Walls of a room are over its floor.
+        over = surfaces[k].pixels_over(view, -low, np.inf if k else high, margin) & (owner + level == 0)
+        on = over & ~surfaces[k].pixels_over(view, low, np.inf, margin)
+        level[on], owner[over & ~on] = k + 1, k + 1
+    step, grid = config.stride, np.s_[:: config.stride, :: config.stride]
+    depth, jump = view.depth[grid].astype(np.float64), 2.0 * config.edge_jump
+    inverse_depth = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0.0)
+    body = np.where(owner[grid] > 0, find_bodies(owner[grid], inverse_depth, jump), -1)
+    rows = np.flatnonzero(body >= 0)
+    names, index, sizes = np.unique(body.ravel()[rows], return_inverse=True, return_counts=True)
+    stands_on = owner[grid].ravel()[names] - 1
+    v, u = step * np.array(np.divmod(rows, body.shape[1]))
+    rays = np.stack([u, v, np.ones(len(u))], axis=-1) @ np.linalg.inv(view.K).T
+    points = transforms.transform(view.pose, depth.ravel()[rows, None] * rays)
+
+    def share(which: Mask) -> Array:
+        """Share of the samples of each body."""
+        return np.asarray(np.bincount(index, which, len(names)) / sizes)
+
+    meeting = _count_meeting(body, owner[grid], level[grid], inverse_depth, jump)[names]
+    near = np.linalg.norm(points[:, :2] - surfaces[0].point_world[:2], axis=1) < reach
+    inner = np.zeros(body.shape, dtype=np.bool_)
+    inner[1:-1, 1:-1] = True
+    cut = share(~inner.ravel()[rows]) > 0.0
+    unfit = (stands_on > 0) & ((meeting < TOUCHING) | (share(near) < 0.5) | cut)
+    height = np.select(
+        [stands_on[index] == k for k in range(len(surfaces))], [s.height(points) for s in surfaces]
+    )
+    top = np.full(len(names), -np.inf)
+    np.maximum.at(top, index, height)
+    unfit |= (stands_on > 0) & ((top > high) | (share(height > 2.0 * low) < 0.05))
+    # What hides the upper end of a body may be what it carries.
+    highest = np.lexsort((height, index))[np.cumsum(sizes) - 1]
+    row, column = np.divmod(rows[highest], body.shape[1])
+    above = inverse_depth[np.maximum(row - 1 - np.arange(3)[:, None], 0), column]
+    hidden = (above > inverse_depth[row, column] + jump).any(axis=0)
+    unfit |= find_furniture(points, index, stands_on, surfaces, config, hidden)
+    lost = np.isin(body, names[unfit]).repeat(step, 0).repeat(step, 1)
+    owner[lost[: owner.shape[0], : owner.shape[1]]] = 0
+    carrying = {0, *stands_on[~unfit].tolist()}
+    if view.rgb is not None:
+        faces = {k: level[grid] == k + 1 for k in carrying if k > 0}
+        carrying -= {
+            k for k, face in faces.items() if face.any() and _is_layer(view, face, surfaces[k], config)
+        }
+    if len(carrying) < len(surfaces):
+        # What carries nothing may itself be the top of an object; what seams cut are the tops of several.
+        numbers = sorted(carrying)
+        some = find_foreground(view, [surfaces[k] for k in numbers], config, reach)
+        found = dict(zip(numbers, some, strict=True))
+        return [found.get(k, np.zeros_like(view.valid)) for k in range(len(surfaces))]
+    return [(owner == k + 1) & surface.pixels_over(view, low, high) for k, surface in enumerate(surfaces)]
+
+
+def find_furniture(
+    points_world: Array,
+    part: NDArray[np.intp],
+    stands_on: NDArray[np.intp],
+    surfaces: Sequence[SupportSurface],
+    config: SegmentationConfig,
+    hidden: Mask,
+) -> Mask:
+    """Find the parts of a view that are legs, walls or uprights of surfaces, and no objects.
+
+    In plan, these are under a higher surface, partly along its border, and reach up to it, or as far as can be
+    seen; or a long one is close to the border of its own surface.
+
+    Args:
+        points_world: Points (N, 3) [m].
+        part: Part (N,) of each, 0 … P − 1.
+        stands_on: Number (P,) of the surface that each part is over.
+        surfaces: The support surfaces.
+        config: Width of the borders.
+        hidden: Whether the upper end of each part is hidden (P,).
+
+    Returns:
+        Which parts (P,).
+    """
+    count = len(stands_on)
+    sizes = np.maximum(np.bincount(part, minlength=count), 1)
+    places, highest = shapely.points(points_world[:, :2]), np.full(count, -np.inf)
+    np.maximum.at(highest, part, points_world[:, 2])
+    lowest = np.array([surface.point_world[2] for surface in surfaces])[stands_on]
+    longest = np.array([np.ptp(points_world[part == k, :2], axis=0).max(initial=0.0) for k in range(count)])
+    furniture = np.zeros(count, dtype=np.bool_)
+    for surface in surfaces:
+        outline = shapely.Polygon(surface.outline_world[:, :2])
+        away = shapely.distance(places, outline.exterior)
+        within = surface.region.grown(config.margin).holds(points_world)
+        close, along, under = (
+            np.bincount(part, which, count) / sizes for which in (away <= THIN, away <= config.margin, within)
+        )
+        room = surface.point_world[2] - lowest
+        leg = (under > MOST) & (along > PARTLY) & (hidden | (highest > lowest + room - config.margin))
+        wall = (close > MOST) & (longest > MIN_WALL)
+        furniture |= ((room > 0.0) & leg) | ((room == 0.0) & wall)
+    return furniture
+
+
+def _is_layer(view: View, level: Mask, surface: SupportSurface, config: SegmentationConfig) -> bool:
+    """Whether seams cut what a view shows of a level face (H, W), on the grid, into tops of objects."""
+    assert view.rgb is not None
+    grid = slice(0, view.depth.shape[0], config.stride), slice(0, view.depth.shape[1], config.stride)
+    up = np.broadcast_to(surface.normal_world @ view.pose[:3, :3], (*level.shape, 3))
+    spacing = config.stride * float(np.median(view.depth[grid][level])) / view.K[0, 0]
+    least = config.min_area / spacing**2
+    seam = find_seams(view.rgb, grid)[: level.shape[0], : level.shape[1]]
+    pieces = cut_at_seams(level.astype(np.int32), up, seam, GAP // config.stride, least)
+    sizes = np.sort(np.bincount(pieces[level]))[::-1]
+    return bool(sizes[0] < 0.5 * sizes.sum())
+
+
+@kernel
+def _count_meeting(body, owner, level, inverse_depth, jump):  # type: ignore[no-untyped-def]
+    """In how many places (H·W,) each body meets readings of its own surface, without a jump of 1/z [1/m].
+
+    Bodies (H, W) are those of `find_bodies`; owner and level (H, W) are the numbers of the surfaces that a
+    place is over, or of. Between the two, one place may be neither.
+    """
+    height, width = body.shape
+    meeting = np.zeros(height * width, np.int64)
+    for row in range(height):
+        for column in range(width):
+            if body[row, column] < 0:
+                continue
+            met = False
+            for down, right in ((1, 0), (2, 0), (0, 1), (0, 2), (-1, 0), (-2, 0), (0, -1), (0, -2)):
+                v, u = row + down, column + right
+                if 0 <= v < height and 0 <= u < width and level[v, u] == owner[row, column]:
+                    met = met or abs(inverse_depth[v, u] - inverse_depth[row, column]) <= jump
+            meeting[body[row, column]] += met
+    return meeting
+
+
+@kernel
+def find_bodies(labels, inverse_depth, jump):  # type: ignore[no-untyped-def]
+    """The first pixel (H, W), counted by rows, of the surface of one label (H, W) that each pixel is on.
+
+    Neighbours of one label are on one surface where 1/z (H, W) differs by no more than a jump [1/m].
+    """
+    height, width = labels.shape
+    first = np.arange(height * width)
+    for row, column in np.ndindex(height, width):
+        if labels[row, column] <= 0:
+            continue
+        for r, c in ((row - 1, column), (row, column - 1)):
+            if r < 0 or c < 0 or labels[r, c] != labels[row, column]:
+                continue
+            if abs(inverse_depth[r, c] - inverse_depth[row, column]) <= jump:
+                one, other = r * width + c, row * width + column
+                while first[one] != one:
+                    first[one] = first[first[one]]
+                    one = first[one]
+                while first[other] != other:
+                    first[other] = first[first[other]]
+                    other = first[other]
+                first[max(one, other)] = min(one, other)
+    for here in range(height * width):
+        first[here] = first[first[here]]
+    return first.reshape(height, width)
