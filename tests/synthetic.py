@@ -7,11 +7,18 @@ from functools import cache
 
 import numpy as np
 
-from caryatid.config import ActiveVisionConfig, Config, FusionMethod, SensorConfig, VoxelConfig
+from caryatid.config import (
+    ActiveVisionConfig,
+    Config,
+    FusionMethod,
+    SensorConfig,
+    SupportConfig,
+    VoxelConfig,
+)
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sphere
+from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, Uncertainty, fibonacci_sphere
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph
+from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
 from caryatid.scene import Scene
 from caryatid.segmentation.support_plane import Region, SupportSurface
 from caryatid.sensing.clouds import oriented_points
@@ -20,6 +27,7 @@ from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
+from caryatid.support.relations import infer
 
 SENSOR = SensorConfig(width=240, height=180, focal=197.0)
 """The Carmine's field of view with a seventh of its pixels: 8 mm between points at 1.5 m."""
@@ -60,6 +68,41 @@ def thing(label: int, shape: Shape, **fields) -> SceneObject:
 def table_object(top: float = TABLE_TOP) -> SceneObject:
     shape = box((0.0, 0.0, top - 0.02), (0.7, 1.0, 0.04))
     return SceneObject(SUPPORT_SURFACE_ID, SUPPORT_LABEL, shape, "support_surface")
+
+
+def surface_object(number: int, middle, size, turn_deg: float = 0.0) -> SceneObject:
+    """A support surface of a size (x, y) [m] around the middle of its top: `o0` with 0, else `s1`, …."""
+    label, centre = SUPPORT_LABEL - number, np.array(middle) - (0.0, 0.0, 0.02)
+    return SceneObject(object_id(label), label, box(centre, (*size, 0.04), turn_deg), "support_surface")
+
+
+def shelf_objects() -> list[SceneObject]:
+    """A low table, the floor and a shelf board, with two objects on each of the lower ones and a ball.
+
+    On the table o0 there are o1 with o2 on it, and o5 under the board s2, which bears the ball o4. On the
+    floor s1, o3 stands beside the table and o6 under it.
+    """
+    firm = Uncertainty(np.full(3, 0.001), np.full(3, 0.005), np.full(3, 0.001), np.full(6, 0.001))
+    shapes = (
+        box((0.0, -0.3, 0.5), (0.12, 0.12, 0.1)),
+        cylinder((0.0, -0.3, 0.6), 0.04, 0.1),
+        box((0.6, 0.0, 0.1), (0.15, 0.2, 0.2), 30.0),
+        sphere((0.0, 0.3, 0.89), 0.04),
+        box((0.0, 0.3, 0.55), (0.1, 0.1, 0.2)),
+        box((0.1, -0.2, 0.06), (0.2, 0.3, 0.12)),
+    )
+    return [
+        surface_object(0, (0.0, 0.0, 0.45), (0.7, 1.0)),
+        surface_object(1, (0.3, 0.0, 0.0), (1.6, 1.8)),
+        surface_object(2, (0.0, 0.3, 0.85), (0.5, 0.35), 10.0),
+        *(thing(k, shape, uncertainty=firm) for k, shape in enumerate(shapes, start=1)),
+    ]
+
+
+@cache
+def shelf_graph() -> SupportGraph:
+    """The graph of `shelf_objects`."""
+    return infer(shelf_objects(), SupportConfig())
 
 
 def surface_at(height: float = TABLE_TOP) -> SupportSurface:

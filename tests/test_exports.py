@@ -14,6 +14,7 @@ import trimesh
 import yourdfpy
 from conftest import run_command
 from scipy.spatial.transform import Rotation
+from synthetic import shelf_graph
 
 from caryatid.config import ExportConfig
 from caryatid.errors import InputError
@@ -82,6 +83,20 @@ def test_a_model_is_a_scene_and_stays_where_it_is_in_mujoco(tmp_path, kept_run):
     assert np.linalg.norm(data.xpos - before, axis=1).max() < 0.005
     turns = Rotation.from_matrix(data.xmat.reshape(-1, 3, 3)) * turned.inv()
     assert np.degrees(turns.magnitude()).max() < 3.0
+
+
+@pytest.mark.parametrize("name", ["scene.xml", "scene.urdf", "scene.gltf", "scene.graphml", "scene.dot"])
+def test_every_support_surface_is_exported(tmp_path, name):
+    export_graph(shelf_graph(), tmp_path / name)
+    text = (tmp_path / name).read_text()
+    assert all(f'"{o.id}"' in text for o in shelf_graph().objects if (o.id, name) != ("o0", "scene.xml"))
+    if name == "scene.xml":
+        scene = load_scene(tmp_path / name)
+        for o in shelf_graph().support_surfaces:
+            body = scene.data.body("table" if o.id == "o0" else o.id)
+            np.testing.assert_allclose(body.xpos, o.centre_world, atol=1e-9)
+        bodies = {i: scene.data.body(i).xpos for i in scene.object_bodies.values()}
+        assert all(np.linalg.norm(at - shelf_graph()[i].centre_world) < 0.005 for i, at in bodies.items())
 
 
 def test_urdf_has_the_poses_sizes_and_masses_of_the_model(tmp_path, graph):

@@ -15,6 +15,7 @@ from conftest import refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from synthetic import shelf_graph
 
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
@@ -85,6 +86,13 @@ def test_a_graph_is_read_back():
     assert graph_text(again) == graph_text(graph)
     assert again.stability == graph.stability
     assert everything(again) == everything(graph)
+
+
+def test_a_graph_with_several_support_surfaces_is_read_back():
+    again = graph_from_json(json.loads(graph_text(shelf_graph())), "graph.json")
+    assert graph_text(again) == graph_text(shelf_graph())
+    assert [o.id for o in again.support_surfaces] == ["o0", "s1", "s2"]
+    assert again.support_surface.id == "o0"
 
 
 def test_a_graph_is_as_documented_and_noise_below_a_nanometre_changes_no_byte():

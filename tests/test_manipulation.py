@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import SMALL, refusal, run_command
-from synthetic import box, sphere, table_object, thing
+from synthetic import box, shelf_graph, shelf_objects, sphere, table_object, thing
 
 from caryatid.config import Config, GripperConfig, LiftConfig, RehearsalConfig, SupportConfig
 from caryatid.errors import InputError
@@ -18,6 +18,7 @@ from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Uncertainty
+from caryatid.geometry.solids import Polytope, Solid
 from caryatid.graph import Grasp, Support, SupportGraph, TakeStep
 from caryatid.manipulation.clearing import SimulatedHands, bodies_of, clear
 from caryatid.manipulation.grasps import Blocked, find_grasp, gripper_boxes
@@ -165,6 +166,36 @@ class TestOrder:
         assert "o2 with probability 0.50" in bold.why
         doubtful = replace(told, supports=(*floating.supports, Support("o1", "o2", probability=0.25)))
         assert plan_order(doubtful, with_risk(0.5), goal="o1", hands=1).steps[0].risk == pytest.approx(1 / 3)
+
+    def test_what_is_under_a_board_or_a_table_is_taken_out_from_under_it(self):
+        """Straight up, o5 would hit the board and the ball on it, and o6 the table and the stack on it."""
+        for goal, taken in (("o4", ["o4"]), ("o5", ["o5"]), ("o6", ["o6"]), ("o1", ["o2", "o1"])):
+            order = plan_order(shelf_graph(), CONFIG, goal=goal)
+            assert order.safe
+            assert [s.object_id for s in order.steps] == taken
+
+    def test_rehearsals_have_all_support_surfaces(self):
+        """Of these stacks, one on each surface, the graph knows nothing; what falls would be held."""
+        firm = shelf_objects()[3:5]
+        stacks = [(0.0, -0.3, 0.45), (0.6, 0.4, 0.0), (0.0, 0.3, 0.85)]
+        halves = [box((x, y, z + h), (0.08, 0.08, 0.1)) for x, y, z in stacks for h in (0.05, 0.15)]
+        things = [replace(firm[0], id=f"o{k}", label=k, shape=s) for k, s in enumerate(halves, start=1)]
+        graph = SupportGraph((*shelf_objects()[:3], *things))
+        for lower, upper in (("o1", "o2"), ("o3", "o4"), ("o5", "o6")):
+            order = plan_order(graph, CONFIG, goal=lower)
+            assert [s.object_id for s in order.steps] == [upper, lower]
+
+    def test_solids_that_overlap_in_many_parts_disturb_each_other_and_cost_no_time(self):
+        """MuJoCo has no room for the forces of their contacts, and took minutes for a third of them."""
+
+        def wall(x):
+            slabs = [box((x, 0.01 * k, TOP + 0.1), (0.1, 0.01, 0.2)) for k in range(40)]
+            return Solid.of([Polytope.around(slab.outline()) for slab in slabs])
+
+        apart = box((0.3, 0.0, TOP + 0.03), (0.06, 0.06, 0.06))
+        order = plan_order(graph_of(wall(0.0), wall(0.04), apart), CONFIG)
+        assert "lifting o1 disturbs o2, lifting o2 disturbs o1" in order.refusal
+        assert [s.safe for s in order.steps if s.object_id == "o3"] == [True]
 
     def test_nothing_to_take_and_unknown_goals_are_refused(self):
         with pytest.raises(InputError, match="no objects"):

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import SMALL, run_command
+from synthetic import shelf_graph
 
 from caryatid.config import ActiveVisionConfig, RobotConfig, SupportConfig, VoxelConfig
 from caryatid.errors import InputError, PlanningError
@@ -26,6 +27,8 @@ from caryatid.planning.expected_visibility import (
     SPACE,
     predict_goal,
     settled,
+    space_above,
+    space_samples,
 )
 from caryatid.planning.planners import BUILT_IN, VOLUMETRIC, make_planner
 from caryatid.planning.planners.baselines import STOPS, RandomPlanner
@@ -101,6 +104,25 @@ def plan(name, objects, supports=(), seed=0, **settings):
 
 def degrees_between(a, b):
     return np.rad2deg(transforms.angle_between(a, b))
+
+
+def test_unseen_space_is_sought_over_every_support_surface_up_to_the_next():
+    """As high as the highest heap, 0.2 m; over the table, a board 0.1 m higher ends it."""
+    *surfaces, board = shelf_graph().support_surfaces
+    lower = replace(board, shape=replace(board.shape, T_world_object=board.shape.T_world_object.copy()))
+    lower.shape.T_world_object[2, 3] -= 0.3
+    objects = [o for o in shelf_graph().objects if o.id in ("o1", "o2", "o3")]
+    graph = SupportGraph((*surfaces, lower, *objects))
+    nothing = VoxelMap.around((0.2, 0.0, 0.08), VoxelConfig())
+    found = space_samples(graph, nothing.occluders([o.shape for o in graph.objects]))
+    x, y, z = found.points_world.T
+    on_board = (np.abs(x) < 0.15) & (np.abs(y - 0.3) < 0.1)
+    beside = (np.abs(x) < 0.3) & (y < 0.0)
+    floor, table, over = ({round(top + 0.02 + 0.04 * k, 2) for k in range(5)} for top in (0.0, 0.45, 0.55))
+    assert {*z[beside].round(2).tolist()} == floor | table
+    assert {*z[on_board].round(2).tolist()} == floor | {0.47} | over
+    low, high = space_above(graph, nothing)
+    assert (low[2], high[2]) == pytest.approx((0.02, 0.75))
 
 
 class TestPointsOfInterest:

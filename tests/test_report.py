@@ -9,6 +9,7 @@ import re
 from base64 import b64decode
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -18,6 +19,7 @@ from conftest import SMALL as SMALL_SENSOR
 from conftest import run_command
 from PIL import Image
 from pypdf import PdfReader
+from synthetic import shelf_graph
 
 from caryatid.config import ReportConfig
 from caryatid.errors import InputError
@@ -37,10 +39,11 @@ from caryatid.viz.drawings import (
     draw_image,
     draw_sphere,
 )
-from caryatid.viz.graph_drawing import draw_graph
+from caryatid.viz.graph_drawing import arrange, draw_graph, widths
 from caryatid.viz.pictures import picture_svg
 from caryatid.viz.report import Figure, Report, make_report, print_pdf, render_html
 from caryatid.viz.scene_3d import scene_3d_html
+from caryatid.viz.tables import census, changes
 
 SMALL = ReportConfig(image_width=160)
 TOP = 0.7
@@ -306,7 +309,48 @@ def test_all_that_is_doubtful_is_listed(make_step, probability, doubtful, text):
     assert section.text.startswith(text) == bool(text or not section.text)
 
 
+def test_a_doubt_of_two_objects_is_listed_once(make_step):
+    both = {
+        "o1": "overlaps o2 by 9 mm; overlaps o2 by 3 mm",
+        "o2": "overlaps o1 by 9 mm; floats over o1 by 4 mm",
+    }
+    table, *objects = make_graph().objects[:3]
+    objects = [replace(o, doubt=both[o.id], poor_fit=False, probability=1.0) for o in objects]
+    supports = tuple(Support("o0", o.id, probability=1.0) for o in objects)
+    step = replace(make_step(0), graph=SupportGraph((table, *objects), supports))
+    (section,) = (s for s in make_report("t", [step], config=SMALL).sections if "doubtful" in s.title)
+    said = [(name, why.split(".")[0]) for name, why in section.facts]
+    assert said == [("o1", "overlaps o2 by 9 mm"), ("o2", "floats over o1 by 4 mm")]
+
+
 # Drawings
+
+
+def test_each_object_is_drawn_over_its_own_support_surface():
+    graph, broad = shelf_graph(), widths(shelf_graph())
+    places, _ = arrange(graph)
+    spans = {i: (places[i][0] - width / 2.0, places[i][0] + width / 2.0) for i, width in broad.items()}
+    assert list(spans) == ["o0", "s1", "s2"]
+    ordered = sorted(spans.values())
+    assert all(end <= start + 1e-9 for (_, end), (start, _) in pairwise(ordered))
+    for support in (s for s in graph.supports if s.supporter in spans):
+        low, high = spans[support.supporter]
+        x, layer = places[support.supported]
+        assert low + 0.5 <= x + 1e-9 <= high - 0.5 + 2e-9
+        assert layer == 1.0
+    svg = picture_svg(draw_graph(graph))
+    assert all(f"{i} · support surface" in svg for i in spans)
+
+
+def test_several_support_surfaces_are_named_and_one_is_the_table(make_step):
+    graph, levels = make_graph(), shelf_graph()
+    assert census(levels) == "6 objects on 3 support surfaces, 6 supports"
+    (found,) = changes(None, replace(make_step(0), graph=levels))
+    assert "o1 (box) supported by o0, o2 (cylinder) supported by o1, o3 (box) supported by s1" in found
+    (found,) = changes(None, replace(make_step(0), graph=graph))
+    assert "o1 (box) supported by the table and o2?, o2" in found
+    tags = re.findall(r">(\w+)</text>", picture_svg(draw_cloud(make_cloud(levels), levels, 0.0)))
+    assert sorted(tags) == sorted(levels)
 
 
 def test_segments_have_their_objects_hue_in_the_image(make_step):

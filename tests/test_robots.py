@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 from importlib.metadata import EntryPoint
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from arms import SLIDES, assert_gaze, gantry, within_arms_length
 from conftest import SMALL, run_command
+from synthetic import shelf_graph, surface_at, surface_object
 
 from caryatid import robots
 from caryatid.config import ActiveVisionConfig, ArmConfig, Config, RobotConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
+from caryatid.graph import SupportGraph
 from caryatid.robots import Posture, Surroundings, find_robot, go_home
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.floor import FloorGrid
@@ -70,6 +73,19 @@ class TestFloorGrid:
     def test_walls_hide_and_the_table_under_the_target_does_not(self):
         eyes = np.array([[1.3, 0.0, 1.5], [-1.3, 0.0, 1.5], [0.9, 0.0, 8.0]])
         assert floor(TABLE, WALL).hidden(eyes, np.array([0.0, 0.0, 0.74])).tolist() == [True, False, False]
+
+    def test_a_robot_stands_on_the_floor_but_not_under_a_table_or_a_board(self):
+        """The floor of the model is also a support surface; a second table is not in reach of the first."""
+        surfaces = [*shelf_graph().support_surfaces, surface_object(3, (-1.5, 1.0, 0.7), (0.4, 0.4))]
+        table = surface_at(0.45)
+        scene = SimpleNamespace(
+            surface=table, sphere=SimpleNamespace(centre_world=table.point_world), config=Config(),
+            graph=SupportGraph(tuple(surfaces)),
+        )  # fmt: skip
+        places = np.array([(0.0, 0.0), (-1.0, 0.0), (1.0, -0.8), (-1.5, 1.0), (-1.5, -1.0)])
+        floor = table_floor(scene)
+        free = floor.free.ravel()[floor.cells(places)[0]]
+        assert free.tolist() == [False, True, True, False, True]
 
 
 class TestHumanoidRobot:

@@ -17,7 +17,17 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from synthetic import FEW_VIEWS, TABLE_TOP, box, cylinder, simulated_scene, sphere, table_object, thing
+from synthetic import (
+    FEW_VIEWS,
+    TABLE_TOP,
+    box,
+    cylinder,
+    shelf_graph,
+    simulated_scene,
+    sphere,
+    table_object,
+    thing,
+)
 
 from caryatid.config.settings import write_settings
 from caryatid.errors import InputError
@@ -226,6 +236,17 @@ def test_a_graph_survives_the_way_to_another_node():
     names = ["CUBE", "SPHERE", "CYLINDER", "ARROW", "TEXT_VIEW_FACING", "TRIANGLE_LIST", "DELETEALL"]
     ours = ["CUBE", "SPHERE", "CYLINDER", "ARROW", "TEXT", "TRIANGLES", "DELETE_ALL"]
     assert [getattr(messages, name) for name in ours] == [constants[name] for name in names]
+
+
+def test_every_support_surface_is_told_and_drawn():
+    header = image(np.zeros((1, 1)), "mono8").header
+    told = packed(messages.graph_message(make, shelf_graph(), [], header))
+    surfaces = [(o.id, o.label) for o in told.objects if o.role == "support_surface"]
+    assert surfaces == [("o0", 65535), ("s1", 65534), ("s2", 65533)]
+    drawn = packed(messages.markers_message(make, shelf_graph(), header)).markers
+    assert [m.text for m in drawn if m.ns == "ids"] == list(shelf_graph())
+    (up,) = (m for m in drawn if m.ns == "supports" and m.points[1].z == 0.89)
+    assert [(p.x, p.y, p.z) for p in up.points] == [(0.0, 0.3, 0.83), (0.0, 0.3, 0.89)]
 
 
 def test_a_lift_says_how_the_gripper_takes_hold():

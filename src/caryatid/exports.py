@@ -74,7 +74,9 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
 
 
 def _mjcf(graph: SupportGraph, config: ExportConfig) -> str:
-    """The static body `table`, and a free body per object, named by its id: a scene to explore.
+    """The static body `table`, others for further surfaces, and a free body per object, named by their ids.
+
+    It is a scene to explore.
 
     Fitted shapes may overlap or hover by millimetres: objects settle by about as much when it is simulated.
     """
@@ -89,8 +91,9 @@ def _mjcf(graph: SupportGraph, config: ExportConfig) -> str:
                 add_body(spec, item.id, Body(item.shape, config.density, config.friction), _rgba(item))
                 continue
             R, size = item.shape.T_world_object[:3, :3], item.shape.extents / 2.0
-            table = spec.worldbody.add_body(name=TABLE, pos=item.centre_world, quat=quaternion(R))
-            table.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, rgba=_rgba(item))
+            name = TABLE if item is graph.support_surface else item.id
+            static = spec.worldbody.add_body(name=name, pos=item.centre_world, quat=quaternion(R))
+            static.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, rgba=_rgba(item))
         spec.compile()
         text: str = spec.to_xml()
         mujoco.MjModel.from_xml_string(text)
@@ -206,7 +209,7 @@ def _graphml(graph: SupportGraph) -> str:
 
 
 def to_dot(graph: SupportGraph) -> str:
-    """Write the support graph as DOT, drawn as in the report: the table below, doubtful supports dashed."""
+    """Write the support graph as DOT, drawn as in the report: surfaces below, doubtful supports dashed."""
     lines = ["digraph supports {", "  rankdir=BT;", '  node [style=filled, fontname="sans-serif"];']
     for item in graph.objects:
         colour = object_colour(item.label)

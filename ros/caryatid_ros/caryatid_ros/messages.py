@@ -181,7 +181,7 @@ def markers_message(make: Make, graph: SupportGraph, header: Any) -> Any:
     for s in graph.supports:
         end = graph[s.supported].centre_world
         start = graph[s.supporter].centre_world
-        if graph[s.supporter].role == "support_surface":  # straight up, not from the middle of the table
+        if graph[s.supporter].role == "support_surface":  # straight up, not from its middle
             start = np.array([*end[:2], start[2]])
         width = ARROW_WIDTH * max(s.belief, 0.1)
         points, scale = [_point(make, start), _point(make, end)], _vector(make, (width, 2.5 * width, 0.0))

@@ -165,8 +165,7 @@ def bodies_of(graph: SupportGraph, truth: TrueScene) -> dict[str, str]:
     It is the one it overlaps most; an object with an overlap below 0.01 (IoU) represents none.
     """
     found = score(graph, truth, np.random.default_rng(0), replace(EvaluationConfig(), min_iou=0.01))
-    surfaces = {o.id for o in graph.support_surfaces}
-    return {i: body for i, body in found.matches.items() if i not in surfaces}
+    return {i: body for i, body in found.matches.items() if graph[i].role == "object"}
 
 
 class SimulatedHands:
@@ -194,7 +193,7 @@ class SimulatedHands:
 
     @property
     def left(self) -> list[str]:
-        """Names of the bodies that are still on the table."""
+        """Names of the bodies that are still in place."""
         return [n for n, z in zip(self.names, self.state[:, 2], strict=True) if z < ASIDE / 2.0]
 
     def bodies(self, graph: SupportGraph) -> dict[str, str]:

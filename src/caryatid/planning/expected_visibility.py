@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from caryatid.config import ActiveVisionConfig, SupportConfig
 from caryatid.geometry.polygons import hull
+from caryatid.geometry.shapes import Primitives
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SupportGraph
+from caryatid.graph import SceneObject, SupportGraph
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.sensing.voxel_map import UNKNOWN, Occluders, VoxelMap
 from caryatid.support.relations import Removal, removal_of
@@ -26,7 +27,8 @@ SPACE = "unseen space"
 SURFACE_SAMPLES = 400
 """Points on the fitted shapes that are tested for being seen [1]."""
 SPACE_WEIGHT = 0.5
-"""Weight of all the space on the table, relative to all surfaces of objects [1]; little of it holds any."""
+"""Weight of all the space on support surfaces, relative to all surfaces of objects [1]; little of it holds
+any."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -69,7 +71,7 @@ def surface_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
     """Spread points over the objects' surfaces; together they weigh 1.
 
     Every object weighs the same, small or large: each is one vertex of the graph. Points that touch another
-    shape or the table can never be seen and are left out.
+    shape or a support surface can never be seen and are left out.
     """
     objects = [o for o in graph.objects if o.role == "object"]
     size = occluders.voxels.config.size
@@ -88,55 +90,114 @@ def surface_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
 
 
 def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | None:
-    """Find the box over the table, within the map, that may hold something, up to the highest object's top.
+    """Find the box around all space over the support surfaces that may hold something.
 
-    It begins two voxels over the table, clear of readings of its top. Return its corners (3,) and (3,) [m],
-    or None without a table, objects, or space between them.
+    Return its corners (3,) and (3,) [m], or None without a support surface, objects, or space between them.
     """
-    table = graph.support_surface
-    objects = [o for o in graph.objects if o.role == "object"]
-    if table is None or not objects:
+    spaces = spaces_above(graph, voxels)
+    if not spaces:
         return None
+    lows, highs = zip(*((low, high) for _, low, high in spaces), strict=True)
+    return np.min(lows, axis=0), np.max(highs, axis=0)
+
+
+def spaces_above(graph: SupportGraph, voxels: VoxelMap) -> list[tuple[SceneObject, Array, Array]]:
+    """Find the box over each support surface, within the map, that may hold something.
+
+    It is as high as the highest heap over its surface, and begins two voxels over the surface, clear of
+    readings of its top.
+
+    Returns:
+        The surface and the corners (3,) and (3,) [m] of its box; none without objects or without space.
+    """
+    bases = bases_of(graph)
+    if not bases:
+        return []
     axes = np.eye(3)
-    reach = table.shape.support(axes)
-    low, high = table.centre_world - reach, table.centre_world + reach
-    low[2] = high[2] + 2.0 * voxels.config.size
-    high[2] = max(float(o.centre_world[2] + o.shape.support(axes[2:])[0]) for o in objects)
-    low, high = np.maximum(low, voxels.origin_world), np.minimum(high, voxels.end_world)
-    return None if (high <= low).any() else (low, high)
+    room = max(_top(graph[i]) - _top(base) for i, base in bases.items())
+    spaces = []
+    for surface in graph.support_surfaces:
+        reach = surface.shape.support(axes)
+        low, high = surface.centre_world - reach, surface.centre_world + reach
+        low[2], high[2] = high[2] + 2.0 * voxels.config.size, high[2] + room
+        low, high = np.maximum(low, voxels.origin_world), np.minimum(high, voxels.end_world)
+        if (high > low).all():
+            spaces.append((surface, low, high))
+    return spaces
+
+
+def bases_of(graph: SupportGraph) -> dict[str, SceneObject]:
+    """Find the support surface that each object is over, by its id: the highest one below its centre.
+
+    Objects over none count as over the main one; without support surfaces, the dict is empty.
+    """
+    surfaces, objects = graph.support_surfaces, [o for o in graph.objects if o.role == "object"]
+    if not surfaces or not objects:
+        return {}
+    low, high = Primitives.of([o.shape for o in objects]).bounds()
+    start, end = Primitives.of([o.shape for o in surfaces]).bounds()
+    over = ((low[:, None, :2] < end[:, :2]) & (start[:, :2] < high[:, None, :2])).all(axis=-1)
+    height = np.array([o.centre_world[2] for o in surfaces])
+    over &= height < np.array([[o.centre_world[2]] for o in objects])
+    best = np.where(over, height, -np.inf).argmax(axis=1)
+    return {o.id: surfaces[k] for o, k in zip(objects, best.tolist(), strict=True)}
+
+
+def _top(o: SceneObject) -> float:
+    """Height [m] of an object's highest point."""
+    return float(o.centre_world[2] + o.shape.support(np.eye(3)[2:])[0])
 
 
 def space_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
-    """Spread points, four voxels apart, over the unseen space on the table, which may hold something.
+    """Spread points, four voxels apart, over the unseen space on support surfaces, which may hold something.
 
-    Space counts up to the height of the highest object, fully at the table and less the higher it is,
-    because something must support its content. A completely unseen table weighs `SPACE_WEIGHT`. The space
-    among the objects, over the convex hull of their outlines, weighs 1 more, as much as all their surfaces:
-    it holds whatever supports a heap or leans on it.
+    Space counts up to the height of the highest heap or the next surface, fully at its surface and less the
+    higher it is, because something must support its content. If completely unseen, it weighs `SPACE_WEIGHT`.
+    The space among the objects, over the convex hull of the outlines of those over the same surface, weighs 1
+    more, as much as all their surfaces: it holds whatever supports a heap or leans on it.
     """
-    table, corners = graph.support_surface, space_above(graph, occluders.voxels)
-    if table is None or corners is None:
-        return relation_samples(())
-    low, high = corners
     spacing = 4.0 * occluders.voxels.config.size
-    x, y, z = (np.arange(a, b, spacing) for a, b in zip(low, high, strict=True))
-    places = np.stack(np.meshgrid(x, y, table.centre_world[2]), axis=-1).reshape(-1, 3)
-    T, half = table.shape.T_world_object, table.shape.extents / 2.0
-    places = places[(np.abs((places - T[:3, 3]) @ T[:3, :2]) <= half[:2]).all(axis=1)]
-
-    outlines = [o.shape.footprint() for o in graph.objects if o.role == "object"]
-    heap = shapely.Polygon(hull(np.concatenate(outlines)))
-    shapely.prepare(heap)
-    in_heap = shapely.contains_xy(heap, places[:, :2])
-    across = SPACE_WEIGHT / max(len(places), 1) + in_heap / max(np.count_nonzero(in_heap), 1)
-    upwards = 1.0 - (z - low[2]) / (high[2] - low[2])
-    weights = (across[:, None] * (upwards / upwards.sum())).ravel()
-    points = np.repeat(places, len(z), axis=0)
-    points[:, 2] = np.tile(z, len(places))
+    parts = [_space_over(*space, graph, spacing) for space in spaces_above(graph, occluders.voxels)]
+    if not parts:
+        return relation_samples(())
+    points, among, shares = map(np.concatenate, zip(*parts, strict=True))
+    even, heaps = max(shares.sum(), 1.0), max((among * shares).sum(), 1.0)
+    weights = (SPACE_WEIGHT / even + among / heaps) * shares
     unseen = occluders.voxels.state_at(points) == UNKNOWN
     unseen[unseen] = ~occluders.holds(points[unseen])
     points, weights = points[unseen], weights[unseen]
     return Samples(points, np.zeros_like(points), weights, np.zeros(len(points), dtype=np.intp), (SPACE,))
+
+
+def _space_over(
+    surface: SceneObject, low: Array, high: Array, graph: SupportGraph, spacing: float
+) -> tuple[Array, NDArray[np.bool_], Array]:
+    """Points (N, 3) in the box over a surface, below others; which are among its objects; their shares (N,).
+
+    The shares of a column of points add up to 1.
+    """
+    x, y, z = (np.arange(a, b, spacing) for a, b in zip(low, high, strict=True))
+    places = np.stack(np.meshgrid(x, y, surface.centre_world[2]), axis=-1).reshape(-1, 3)
+    places = places[_within(surface, places)]
+    outlines = [graph[i].shape.footprint() for i, base in bases_of(graph).items() if base is surface]
+    heap = shapely.Polygon(hull(np.concatenate(outlines)) if outlines else None)
+    shapely.prepare(heap)
+    among = np.repeat(shapely.contains_xy(heap, places[:, :2]), len(z))
+    upwards = 1.0 - (z - low[2]) / (high[2] - low[2])
+    shares = np.tile(upwards / upwards.sum(), len(places))
+    points = np.repeat(places, len(z), axis=0)
+    points[:, 2] = np.tile(z, len(places))
+    free = np.ones(len(points), dtype=np.bool_)
+    for cover in graph.support_surfaces:
+        if cover.centre_world[2] > surface.centre_world[2]:
+            free &= (points[:, 2] < cover.centre_world[2]) | ~_within(cover, points)
+    return points[free], among[free], shares[free]
+
+
+def _within(surface: SceneObject, points: Array) -> NDArray[np.bool_]:
+    """Which points (N, 3) are over or under a support surface."""
+    T, half = surface.shape.T_world_object, surface.shape.extents / 2.0
+    return np.asarray((np.abs((points - T[:3, 3]) @ T[:3, :2]) <= half[:2]).all(axis=1))
 
 
 def relation_samples(points: Sequence[PointOfInterest]) -> Samples:

@@ -139,8 +139,10 @@ def find_furniture(
         outline = shapely.Polygon(surface.outline_world[:, :2])
         away = shapely.distance(places, outline.exterior)
         within = surface.region.grown(config.margin).holds(points_world)
+        # Something on the surface may hide a corner of it.
+        border = within & ((away <= config.margin) | ~shapely.contains(outline, places))
         close, along, under = (
-            np.bincount(part, which, count) / sizes for which in (away <= THIN, away <= config.margin, within)
+            np.bincount(part, which, count) / sizes for which in (away <= THIN, border, within)
         )
         room = surface.point_world[2] - lowest
         leg = (under > MOST) & (along > PARTLY) & (hidden | (highest > lowest + room - config.margin))

@@ -518,15 +518,22 @@ class Session:
 
 
 def table_floor(scene: Scene) -> FloorGrid:
-    """The floor around the table of a scene; the area under the table top is blocked."""
+    """The floor around the support surfaces of a scene; the area under the main one is blocked.
+
+    Of several, the lowest is the floor itself if it is at its height.
+    """
     assert scene.surface is not None
     assert scene.sphere is not None
     shape = scene.surface.shape
     top = float(scene.surface.point_world[2])
     T_world_box = transforms.rigid(shape.T_world_object[:3, :3], (*shape.T_world_object[:2, 3], top / 2.0))
     extents = np.array([*shape.extents[:2], max(abs(top), 2.0 * STEP)])
-    box = Box(T_world_box, extents)
-    return FloorGrid.from_boxes([box], scene.config.robot, scene.sphere.centre_world[:2])
+    surfaces = scene.graph.support_surfaces
+    boxes = [Box(T_world_box, extents), *(o.shape for o in surfaces[1:] if isinstance(o.shape, Box))]
+    heights = [top, *(float(o.centre_world[2]) for o in surfaces[1:])]
+    if len(boxes) > 1 and min(heights) <= STEP:
+        del boxes[int(np.argmin(heights))]
+    return FloorGrid.from_boxes(boxes, scene.config.robot, scene.sphere.centre_world[:2])
 
 
 def reached_candidates(robot: Robot, T_world_camera: Array, sphere: ViewSphere) -> Candidates:

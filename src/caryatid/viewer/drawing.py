@@ -18,7 +18,7 @@ from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Cloud, View
 from caryatid.viz.colours import SALIENCY_STOPS, Colour, label_colours, object_colour, rgb, scale
-from caryatid.viz.drawings import image_of
+from caryatid.viz.drawings import image_of, named_objects
 from caryatid.viz.scene_3d import support_ends
 from caryatid.viz.tables import count_of
 
@@ -195,7 +195,7 @@ class SceneDrawing:
         return nodes
 
     def _names(self, graph: SupportGraph) -> list[Any]:
-        found = (item for item in graph.objects if item.role == "object")
+        found = named_objects(graph)
         return [self._label(f"/names/{item.id}", item.id, item.centre_world) for item in found]
 
     def _label(self, name: str, text: str, at: Array) -> Any:
@@ -207,7 +207,7 @@ class SceneDrawing:
         return [self._scene.add_line_segments(name, ends, colours, **look)] if len(ends) else []
 
     def _supports(self, graph: SupportGraph) -> list[Any]:
-        """Arrows from centre to centre, which show through the shapes; of the table only if doubtful."""
+        """Arrows from centre to centre, which show through the shapes; of surfaces only if doubtful."""
         nodes: list[Any] = []
         for number, support in enumerate(graph.supports):
             if graph[support.supporter].role == "support_surface" and not support.doubtful:

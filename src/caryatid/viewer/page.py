@@ -277,7 +277,7 @@ def _describe_signs() -> str:
     """Explain the symbols in the scene."""
     signs = {
         "Arrow": "supporter → supported; thicker = more probable, dashed = doubtful. "
-        "Supports by the table are drawn only if doubtful",
+        "Supports by a support surface are drawn only if doubtful",
         "Number on an arrow": "probability of the support, if below 1",
         "Coloured dots on the sphere": "candidate views that the robot can reach, coloured by saliency",
         "Fine grey dots": "views out of reach",

@@ -19,7 +19,7 @@ from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.sensing.view_sphere import direction
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+from caryatid.sensing.views import MAX_LABEL, Cloud, View
 from caryatid.viz import colours
 from caryatid.viz.colours import object_colour
 from caryatid.viz.pictures import (
@@ -84,8 +84,14 @@ class Projection:
         return Tag(float(x), float(y), item.id, object_colour(item.label))
 
 
+def named_objects(graph: SupportGraph) -> list[SceneObject]:
+    """Find what pictures name: the objects, and the support surfaces if there are several."""
+    several = len(graph.support_surfaces) > 1
+    return [o for o in graph.objects if several or o.role == "object"]
+
+
 def draw_shapes(objects: Sequence[SceneObject], projection: Projection) -> Element:
-    """Draw the lines of shapes, the surface first: strong on a dark rim, thin and faint where hidden."""
+    """Draw the lines of shapes, support surfaces first: strong on a dark rim, thin and faint where hidden."""
     from scipy.ndimage import median_filter
 
     faint, rims, strong = [], [], []
@@ -117,7 +123,7 @@ def draw_image(
         width: Of the picture [px].
         shapes: Draw the shapes, and the names also of objects without a pixel.
     """
-    found = [o for o in graph.objects if o.role != "support_surface"]
+    found = named_objects(graph)
     step = max(1, view.depth.shape[1] // (4 * width))  # of what is shown, two pixels for each drawn
     if step > 1:
         view, labels = view.every(step), labels[::step, ::step]
@@ -160,7 +166,7 @@ def tint(image: NDArray[np.uint8], labels: NDArray[np.int32]) -> NDArray[np.uint
     v, u = np.mgrid[: labels.shape[0], : labels.shape[1]]
     lit = (image @ np.array([0.299, 0.587, 0.114]))[..., None]
     colour = 0.62 * colours.striped_colours(labels, u, v, 18.0) + 0.38 * lit
-    segment = ((labels != 0) & (labels != SUPPORT_LABEL))[..., None]
+    segment = ((labels != 0) & (labels <= MAX_LABEL))[..., None]
     return np.where(segment, np.dstack([colour, np.full(labels.shape, 255.0)]), 0.0).astype(np.uint8)
 
 
@@ -170,7 +176,7 @@ def window(labels: NDArray[np.int32]) -> tuple[int, int, int, int]:
     It has the image's proportions and is half as wide at least.
     """
     size = np.array(labels.shape[::-1])
-    found = np.argwhere((labels != 0) & (labels != SUPPORT_LABEL))[:, ::-1]
+    found = np.argwhere((labels != 0) & (labels <= MAX_LABEL))[:, ::-1]
     low, high = (found.min(axis=0), found.max(axis=0)) if len(found) else (np.zeros(2), size)
     share = float(np.clip(1.35 * ((high - low) / size).max(), 0.5, 1.0))
     left, top = np.clip((low + high - share * size) / 2.0, 0.0, (1.0 - share) * size).astype(int)
@@ -199,7 +205,7 @@ def draw_cloud(
     frame = _framed(cloud, graph, towards_eye, width)
     at, z = frame.project(cloud.points_world)
     pixels, projection = _splat(cloud, at, z, towards_eye, frame, max(1, round(point_size * frame.K[0, 0])))
-    tags = [projection.tag(o) for o in graph.objects if o.role != "support_surface" and o.id]
+    tags = [projection.tag(o) for o in named_objects(graph) if o.id]
     size = width, pixels.shape[0]
     parts = [raster(pixels, 0.0, 0.0, *size), draw_shapes(graph.objects, projection)]
     parts += draw_tags(tags, *size, 15.0)
@@ -250,7 +256,7 @@ def _splat(
     far_to_near = np.argsort(-z)
     rank = np.zeros((height, width), dtype=np.int64)  # The higher the nearer, 0 = nothing.
     for surface, wide in ((False, side), (True, 2 * side)):
-        own = inside[far_to_near] & ((labels[far_to_near] == SUPPORT_LABEL) == surface)
+        own = inside[far_to_near] & ((labels[far_to_near] > MAX_LABEL) == surface)
         ranked = np.zeros((height, width), dtype=np.int64)
         ranked[v[far_to_near[own]], u[far_to_near[own]]] = np.flatnonzero(own) + 1
         rank = np.maximum(rank, -minimum_filter(-ranked, size=wide, mode="constant"))

@@ -6,7 +6,7 @@ ten edges through vertices, where this draws none.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, pairwise
 from xml.etree.ElementTree import Element
@@ -22,12 +22,12 @@ from caryatid.viz.colours import ink_on, object_colour, object_stripes
 from caryatid.viz.pictures import DOUBT, INK, WRONG, Picture, area, group, keep_apart, line, text
 
 Place = tuple[float, float]
-"""Across, in vertices' widths from the leftmost, and layer, 0 is the table's."""
+"""Across, in vertices' widths from the leftmost, and layer, 0 is that of support surfaces."""
 Pair = tuple[str, str]
 
 
 def arrange(graph: SupportGraph) -> tuple[dict[str, Place], dict[Pair, list[Place]]]:
-    """Lay out a support graph: each object above what supports it, the table alone on the lowest layer.
+    """Lay out a support graph: each object above what supports it, surfaces alone on the lowest layer.
 
     Long edges bend around the vertices of the layers they pass; vertices are ordered by the mean of their
     neighbours (fewer crossings) and spaced as near to it as their width allows.
@@ -50,15 +50,17 @@ def arrange(graph: SupportGraph) -> tuple[dict[str, Place], dict[Pair, list[Plac
     rows: list[list[Hashable]] = [[] for _ in range(max(layer.values(), default=-1) + 1)]
     for name, level in layer.items():
         rows[level].append(name)
-    x = _abscissae(rows, joined, None if graph.support_surface is None else graph.support_surface.id)
-    left = min(x.values(), default=0.0)
+    wide = widths(graph)
+    x = _abscissae(rows, joined, wide)
+    ends = (x[i] - (width - 1.0) / 2.0 for i, width in wide.items())
+    left = min((*x.values(), *ends), default=0.0)
     at = {name: (x[name] - left, float(level)) for name, level in layer.items()}
     routes = {pair: [at[name] for name in chain] for pair, chain in chains.items()}
     return {o.id: at[o.id] for o in graph.objects}, routes
 
 
 def layers(graph: SupportGraph) -> dict[str, int]:
-    """Layer of each object in the support order: 0 for the table, else one more than its highest supporter.
+    """Layer of each object in the support order: 0 for surfaces, else one more than its highest supporter.
 
     Edges count in the order bottom-up, doubtful bottom-up, lean, top-down (reversed, because what
     presses from above lies higher); one that would close a cycle is left out.
@@ -70,32 +72,38 @@ def layers(graph: SupportGraph) -> dict[str, int]:
         support.pair[::-1] if support.kind == "top-down" else support.pair
         for support in sorted(graph.supports, key=lambda s: rank[s.kind] + s.doubtful)
     ]
-    if graph.support_surface is not None:
-        table = graph.support_surface.id
-        pairs += [(table, o.id) for o in graph.objects if o.id != table]
+    pairs += [(s.id, o.id) for s in graph.support_surfaces for o in graph.objects if o.role == "object"]
     for below, above in pairs:
         if not nx.has_path(order, above, below):
             order.add_edge(below, above)
     return {name: k for k, names in enumerate(nx.topological_generations(order)) for name in names}
 
 
+def widths(graph: SupportGraph) -> dict[str, float]:
+    """Width of each support surface, by its id: that of what rests on it; empty if there is only one."""
+    surfaces = graph.support_surfaces
+    carried = {o.id: sum(s.supporter == o.id for s in graph.supports) for o in surfaces}
+    return {i: max(2.4, float(count)) for i, count in carried.items()} if len(surfaces) > 1 else {}
+
+
 def _abscissae(
-    rows: Sequence[Sequence[Hashable]], joined: nx.Graph[Hashable], table: str | None
+    rows: Sequence[Sequence[Hashable]], joined: nx.Graph[Hashable], wide: Mapping[str, float]
 ) -> dict[Hashable, float]:
     """Return x of each name: rows ordered by their neighbours' means, spaced as wide as their vertices.
 
-    The table draws the others to the middle and stays there.
+    A single vertex on the lowest layer, such as the table, draws the others to the middle and stays there.
     """
     from scipy.optimize import isotonic_regression
 
     x = {name: k - (len(row) - 1) / 2.0 for row in rows for k, name in enumerate(row)}
     for sweep in range(24):  # Rounds in which vertices move towards their neighbours.
         for row in rows if sweep % 2 == 0 else reversed(rows):
-            if not row or row[0] == table:
+            if not row or (row is rows[0] and len(row) == 1):
                 continue
-            wish = {name: float(np.mean([x[other] for other in joined[name] or [name]])) for name in row}
+            pull = 0.8 if wide and row is rows[0] else 1.0  # Surfaces move together with what they carry.
+            wish = {n: pull * float(np.mean([x[other] for other in joined[n] or [n]])) for n in row}
             ordered = sorted(row, key=lambda name: (wish[name], x[name]))
-            width = np.array([1.0 if isinstance(name, str) else 0.4 for name in ordered])
+            width = np.array([wide.get(name, 1.0) if isinstance(name, str) else 0.4 for name in ordered])
             offset = np.cumsum(width) - width / 2.0
             spaced = isotonic_regression(np.array([wish[name] for name in ordered]) - offset).x + offset
             x.update(zip(ordered, spaced.tolist(), strict=True))
@@ -115,7 +123,7 @@ def draw_graph(
     *,
     compact: bool = False,
 ) -> Picture:
-    """Draw the support graph: the table below, what it carries above it, doubt in dashes.
+    """Draw the support graph: support surfaces below, what they carry above them, doubt in dashes.
 
     Edges run from supporter to supported and carry their probability, the thicker the higher it is; doubtful
     ones are dashed, leaning and top-down ones say so. Vertices have the shape of their primitive, and a
@@ -134,17 +142,20 @@ def draw_graph(
     marks = dict.fromkeys(map(tuple, wrong), "wrong ") | dict.fromkeys([s.pair for s in lacking], "missing")
     places, routes = arrange(graph)
     passed = [*places.values(), *chain.from_iterable(routes.values()), (0.0, 0.0)]
+    wide = widths(graph)
+    passed += [(places[i][0] + (width - 1.0) / 2.0, 0.0) for i, width in wide.items()]
     span, tall = np.max(passed, axis=0) * pitch * (1.0, -1.0) + (92.0, 76.0)
     width = max(span, least)  # In less space the letters of small graphs grow too large.
     height = max(tall, 0.73 * min(width, least))
     corner = np.array([(width - span) / 2.0 + 46.0, (height + tall) / 2.0 - 30.0])
-    table = None if graph.support_surface is None else graph.support_surface.id
+    bars = {i: width * pitch[0] / 2.0 - 11.0 for i, width in wide.items()}
+    bars = bars or {o.id: width / 2.0 - 12.0 for o in graph.support_surfaces}
     edges, notes, words = [], [], []
     for support in graph.supports:
         points = corner + pitch * routes[support.pair]
         if support.pair[::-1] in routes:
             points[:, 0] += 8.0 * np.sign(points[0, 1] - points[-1, 1])  # Beside the edge that leads back.
-        edges.append(_from_rim_to_rim(points, support, table))
+        edges.append(_from_rim_to_rim(points, support, bars))
         notes.append(edges[-1][-2:].mean(axis=0))
         kind = "" if support.kind == "bottom-up" else f"{support.kind} "
         mark = marks.get(support.pair, "")
@@ -160,21 +171,24 @@ def draw_graph(
         parts.append(text(x, y, word, 12.0, colour))
     for item in graph.objects:
         at, half = corner + pitch * places[item.id], NODE / 2.0
-        if item.id == table:
-            at, half = np.array([width / 2.0, at[1] - 6.0]), np.array([width / 2.0 - 12.0, 14.0])
-        parts.append(_node(item, at, half, supported=item.id == table or bool(graph.supporters(item.id))))
+        if item.id in bars:
+            middle = at[0] if wide else width / 2.0
+            at, half = np.array([middle, at[1] - 6.0]), np.array([bars[item.id], 14.0])
+        parts.append(_node(item, at, half, supported=item.id in bars or bool(graph.supporters(item.id))))
     return Picture("support graph, from the support surface upwards", width, height, parts)
 
 
-def _from_rim_to_rim(points: Array, support: Support, table: str | None) -> Array:
+def _from_rim_to_rim(points: Array, support: Support, bars: Mapping[str, float]) -> Array:
     """The points (N, 2) of an edge, its ends moved to the rims of its vertices, towards where it comes from.
 
-    It meets the table right below its neighbour.
+    It meets a support surface, of half a width [px], right below its neighbour.
     """
     points, most = points.copy(), NODE[0] / 2.0 - 8.0
     for end, other, vertex in ((0, 1, support.supporter), (-1, -2, support.supported)):
         across, along = points[other] - points[end]
-        points[end] += (across if vertex == table else np.clip(0.2 * across, -most, most), 0.0)
+        half = bars.get(vertex, 0.0) - 8.0
+        shift = np.clip(across, -half, half) if vertex in bars else np.clip(0.2 * across, -most, most)
+        points[end] += (shift, 0.0)
         points[end, 1] += np.sign(along) * (NODE[1] / 2.0 + 2.0)
     return points
 
@@ -207,8 +221,8 @@ def _edge(support: Support, course: Array, colour: str, width: float) -> Element
 
 
 def _node(item: SceneObject, at: Array, half: Array, *, supported: bool) -> Element:
-    """A vertex of half a width and height [px]; the table has no evidence."""
-    angle, table = np.linspace(0.0, np.pi, 24), item.role == "support_surface"
+    """A vertex of half a width and height [px]; a support surface has no evidence."""
+    angle, surface = np.linspace(0.0, np.pi, 24), item.role == "support_surface"
     outline = half * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     inner = []
     if item.shape.kind == "cylinder":
@@ -231,9 +245,9 @@ def _node(item: SceneObject, at: Array, half: Array, *, supported: bool) -> Elem
     if not supported:
         kind += " unsupported"
         rim = {"stroke": DOUBT, "stroke_width": "2.4", "stroke_dasharray": "5 3.6"}
-    name, lift = (f"{item.id} · support surface", 0.0) if table else (item.id, 4.0)
+    name, lift = (f"{item.id} · support surface", 0.0) if surface else (item.id, 4.0)
     words = [text(at[0], at[1] - lift, name, 13.0, ink_on(colour), font_weight="bold")]
-    if not table:
+    if not surface:
         evidence = f"{item.occurrences}/{item.opportunities}"
         words.append(text(at[0], at[1] + 10.0, evidence, 9.5, ink_on(colour)))
     return group([area(at + outline, colour, **rim), *inner, *words], kind, f"{item.id}: {item.shape.kind}")

@@ -15,6 +15,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.sensing.view_sphere import direction
 from caryatid.viz.colours import Colour, ink_on, object_colour, rgb
+from caryatid.viz.drawings import named_objects
 from caryatid.viz.pictures import THEME
 
 if TYPE_CHECKING:
@@ -74,29 +75,33 @@ def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
 
     found = [item for item in graph.objects if item.role == "object"] or graph.objects
     points = np.concatenate([item.shape.outline() for item in found])
-    low, high = points.min(axis=0), points.max(axis=0)
 
     def shown(item: SceneObject) -> SceneObject:
-        """Of a surface, only what is below the objects: the page turns about the middle of all."""
+        """Of a surface, only what is below or above objects: the page turns about the middle of all."""
         if item.role == "object":
             return item
-        top = item.centre_world[2] + float(item.shape.support(np.array([[0.0, 0.0, 1.0]]))[0])
-        at = transforms.rigid(np.eye(3), [*((low + high) / 2.0)[:2], top - 0.005])
-        return replace(item, shape=Box(at, np.array([*(high - low)[:2] + 0.1, 0.01])))
+        T, half = item.shape.T_world_object, item.shape.extents / 2.0
+        own = transforms.transform(transforms.invert(T), points)
+        low = np.clip(own.min(axis=0) - 0.05, -half, half - 0.05)
+        high = np.clip(own.max(axis=0) + 0.05, low + 0.05, np.maximum(half, low + 0.05))
+        low[2], high[2] = half[2] - 0.01, half[2]
+        return replace(item, shape=Box(T @ transforms.rigid(np.eye(3), (low + high) / 2.0), high - low))
 
     def look(item: SceneObject) -> TextureVisuals:
         return _material(rgb(object_colour(item.label)), 150 if item.role == "object" else 255)
 
     scene = make_scene(replace(graph, objects=tuple(map(shown, graph.objects))), look)
-    for item in found:
+    for item in named_objects(graph):
         for side, turn in (("front", 0.0), ("back", np.pi)):
-            _add(scene, f"name of {item.id}, {side}", *_plate(item, azimuth + turn))
+            _add(scene, f"name of {item.id}, {side}", *_plate(shown(item), azimuth + turn))
     for number, support in enumerate(graph.supports):
         arrow = _arrow(*support_ends(support, graph), 0.0035 * max(support.belief, 0.3))
         if arrow is not None:
             arrow.visual = _material(rgb(THEME["doubt" if support.doubtful else "ink"]), 255)
             _add(scene, f"support {number}", arrow)
-    centre, reach = scene.bounds.mean(axis=0), float(np.ptp(scene.bounds, axis=0).max())
+    centre, (x, height, y) = scene.bounds.mean(axis=0), np.ptp(scene.bounds, axis=0).tolist()
+    # From 25° above, all fits into 26° of sight at 1.9 times this distance.
+    reach = max(x, y, 1.2 * height + 0.5 * max(x, y))
     forward = direction(azimuth, np.deg2rad(25.0))
     eye = centre + 1.9 * reach * np.array([forward[0], forward[2], -forward[1]])
     scene.camera = trimesh.scene.Camera(name="camera", resolution=(1200, 460), fov=(60.0, 26.0))
@@ -107,7 +112,7 @@ def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
 
 
 def support_ends(support: Support, graph: SupportGraph) -> tuple[Array, Array]:
-    """Where the arrow of a support begins and ends (3,); from the table it rises, from 7 cm below it."""
+    """Where the arrow of a support begins and ends (3,); from a surface it rises, from 7 cm below it."""
     supporter, supported = graph[support.supporter], graph[support.supported]
     start, end, contact = supporter.centre_world, supported.centre_world, support.contact_world
     if supporter.role == "support_surface":
@@ -166,7 +171,11 @@ def _plate(item: SceneObject, azimuth: float) -> tuple[trimesh.Trimesh, Array]:
     corners = np.column_stack([(uv - 0.5) * LETTER * (image.width / 72.0, 1.0), np.zeros(4)])
     look = PBRMaterial(emissiveTexture=image, emissiveFactor=[1.0] * 3, baseColorFactor=[0, 0, 0, 255])
     out, up = direction(azimuth, 0.0), np.array([0.0, 0.0, 1.0])
-    before = item.centre_world + (float(item.shape.support(out[None])[0]) + 0.001) * out
+    reach = float(item.shape.support(out[None])[0])
+    if item.role == "support_surface":  # Beyond a corner the plate would hang in the air: to the edge.
+        across = np.abs(item.shape.T_world_object[:3, :2].T @ out)
+        reach = float((item.shape.extents[:2] / 2.0 / np.maximum(across, 1e-9)).min())
+    before = item.centre_world + (reach + 0.001) * out
     T_world_plate = transforms.rigid(np.column_stack([np.cross(up, out), up, out]), before)
     visual = TextureVisuals(uv=uv, material=look)
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False), T_world_plate

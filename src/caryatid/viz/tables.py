@@ -153,9 +153,10 @@ def count_of(number: int, name: str) -> str:
 
 def census(graph: SupportGraph) -> str:
     """Count the objects and supports of a graph."""
-    objects = sum(o.role == "object" for o in graph.objects)
-    doubtful = sum(s.doubtful for s in graph.supports)
-    text = f"{count_of(objects, 'object')}, {count_of(len(graph.supports), 'support')}"
+    surfaces, doubtful = len(graph.support_surfaces), sum(s.doubtful for s in graph.supports)
+    objects = count_of(sum(o.role == "object" for o in graph.objects), "object")
+    on = f" on {surfaces} support surfaces" if surfaces > 1 else ""
+    text = f"{objects}{on}, {count_of(len(graph.supports), 'support')}"
     return f"{text}, {doubtful} of them doubtful" if doubtful else text
 
 
@@ -163,9 +164,10 @@ def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
     """List doubtful supports and objects with the reason and a view that would help, most doubtful first.
 
     An object is doubtful if it has no known supporter, its shape fits poorly or is implausible, or the
-    probability that its pose and size are about right is low.
+    probability that its pose and size are about right is low. What both of two objects are doubtful for, such
+    as an overlap, is listed once.
     """
-    found = []
+    found, told = [], set[tuple[str, frozenset[str]]]()
     for s in sorted(graph.supports, key=lambda s: abs(s.belief - 0.5)):
         if s.doubtful:
             lead = f"{s.supporter} → {s.supported}, probability {s.belief:.2f}"
@@ -173,7 +175,12 @@ def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
     for item in graph.objects:
         poor = f"the points are {1e3 * item.residual:.1f} mm off the shape on average"
         known = item.role == "support_surface" or graph.supporters(item.id)
-        reasons = [poor] * item.poor_fit + [item.doubt] * bool(item.doubt)
+        reasons = [poor] * item.poor_fit
+        for doubt in filter(None, item.doubt.split("; ")):
+            what, *words = doubt.split()
+            about = what, frozenset([item.id, *(word for word in words if word in graph)])
+            reasons += [doubt] * (about not in told)
+            told.add(about)
         reasons += ["its supporter is unknown"] * (not known)
         if item.probability is not None and item.probability <= DOUBTFUL:
             reasons.append(f"its pose and size are about right with probability {item.probability:.2f} only")
@@ -230,12 +237,15 @@ def changes(before: Step | None, step: Step) -> list[str]:
 
 
 def _supported(graph: SupportGraph) -> dict[str, str]:
-    """Shape and supporters of each object by id; doubtful supporters with a question mark."""
-    texts = {}
+    """Shape and supporters of each object by id; doubtful supporters with a question mark.
+
+    The support surface is the table if it is the only one.
+    """
+    only, texts = len(graph.support_surfaces) == 1, {}
     for item in graph.objects:
         supporters = sorted(graph.supporters(item.id), key=lambda s: s.supporter)
         names = [
-            ("the table" if graph[s.supporter].role == "support_surface" else s.supporter) + "?" * s.doubtful
+            ("the table" if only and graph[s.supporter].role != "object" else s.supporter) + "?" * s.doubtful
             for s in supporters
         ]
         if item.role == "object":

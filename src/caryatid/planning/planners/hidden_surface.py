@@ -102,11 +102,11 @@ def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[
     middles, outward = sums[large, 2:5] / worth[large, None], sums[large, 5:]
     nowhere = np.linalg.norm(outward, axis=1, keepdims=True) < 1e-9
     outward = transforms.unit(np.where(nowhere, middles - state.sphere.centre_world, outward))
-    points = []
+    points, place = [], "the table" if len(state.graph.support_surfaces) < 2 else "the support surfaces"
     for i, middle, direction in zip(large, middles, outward, strict=True):
         name, saliency = samples.names[i], float(worth[i] / most)
         subject = () if name == SPACE else (name,)
-        why = f"{name} on the table" if name == SPACE else f"part of {name} is unseen"
+        why = f"{name} on {place}" if name == SPACE else f"part of {name} is unseen"
         points.append(PointOfInterest(middle, direction, saliency, subject, why))
     return points
 

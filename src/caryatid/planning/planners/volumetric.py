@@ -14,10 +14,10 @@ over the voxels before it, a ray gathers up to the first occupied voxel
   lies before a surface has been seen free, so these are at its back.
 
 They come from the reconstruction of one object in a box known beforehand. Here the box is the space over
-the table up to the height of the highest object. Without it the room behind, the floor, and what is outside
-the image would outweigh everything: half of the map's voxels are still unknown after a first view. For the
-same reason p_v is 1 where a ray enters the box. Unknown space inside objects counts, as it does there: these
-planners do not know shapes.
+the support surfaces up to the height of the highest heap. Without it the room behind, the floor, and what is
+outside the image would outweigh everything: half of the map's voxels are still unknown after a first view.
+For the same reason p_v is 1 where a ray enters the box. Unknown space inside objects counts, as it does
+there: these planners do not know shapes.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ class VolumetricPlanner:
 
         The decision's saliency, cost and score are the two terms of the utility and their difference, in
         units of the largest share of information. Candidates beside an earlier view are left out: these
-        planners do not choose a view of their list twice. Without a table or objects there is no box to look
-        into, and nothing is gathered.
+        planners do not choose a view of their list twice. Without a support surface or objects there is no
+        box to look into, and nothing is gathered.
         """
         check_candidates(state)
         candidates, config = state.candidates, state.config
