@@ -19,7 +19,7 @@ from synthetic import (
 from caryatid.config import FusionConfig
 from caryatid.geometry.shapes import Box
 from caryatid.graph import Support, SupportGraph
-from caryatid.objects.fusion import changed, fuse, fused_graph
+from caryatid.objects.fusion import changed, fuse, fused_graph, renamed, without
 from caryatid.paper import match_by_shape, merge_sightings, unite_graphs
 
 SG, PC, BOTH = (FusionConfig(method=m) for m in ("sg", "pc", "pc+sg"))
@@ -55,6 +55,19 @@ def shift(x):
     motion = np.eye(4)
     motion[0, 3] = x
     return motion
+
+
+def test_texts_name_the_objects_that_the_graph_has():
+    """Two swap their names in one step, one merges with another, and one goes."""
+    found = graph(("o1", "o2"), ("o2", "o11"), shapes={1: CRATE, 2: CAN, 11: BALL})
+    doubts = {"o1": "overlaps o2 by 3 mm; floats over o11 by 4 mm", "o11": "overlaps o2 by 5 mm"}
+    found = replace(found, objects=tuple(replace(o, doubt=doubts.get(o.id, "")) for o in found.objects))
+    swapped = renamed(found, {"o1": "o2", "o2": "o1"})
+    assert [(s.pair, s.why) for s in swapped.supports] == [(("o2", "o1"), "o2>o1"), (("o1", "o11"), "o1>o11")]
+    assert swapped["o2"].doubt == "overlaps o1 by 3 mm; floats over o11 by 4 mm"
+    assert renamed(found, {"o2": "o1"})["o1"].doubt == "floats over o11 by 4 mm"
+    assert without(found, {"o2"})["o1"].doubt == "floats over o11 by 4 mm"
+    assert without(found, {"o2"})["o11"].doubt == ""
 
 
 # Matching

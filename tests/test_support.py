@@ -14,6 +14,7 @@ from caryatid.config import PlausibilityConfig, SupportConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere, Uncertainty
+from caryatid.geometry.solids import Polytope, Solid
 from caryatid.geometry.transforms import rigid
 from caryatid.graph import SceneObject, Support
 from caryatid.paper import infer_by_area
@@ -259,6 +260,18 @@ class TestInfer:
         support = infer(objects, CONFIG).support("o1", "o2")
         assert support.doubtful
         assert support.kind == "bottom-up"
+
+    def test_a_doubt_about_two_solids_is_said_once(self):
+        """Whatever the number of their parts that overlap, with the depth of the deepest."""
+
+        def halves(x, gap):
+            outlines = [block(x, y, 0, (0.2, 0.1, 0.1)).outline() for y in (-0.05, 0.05)]
+            return Solid.of([Polytope.around(outline + (gap, 0.0, 0.0)) for outline in outlines])
+
+        solids = scene(halves(0.0, 0.0), halves(0.2, -0.03))[1:]
+        one, two = reconcile(solids, PlausibilityConfig())
+        assert one.doubt == "overlaps o2 by 30 mm, more than both fits explain"
+        assert two.doubt == "overlaps o1 by 30 mm, more than both fits explain"
 
     @pytest.mark.parametrize(
         ("objects", "pair", "said"),

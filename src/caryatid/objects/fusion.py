@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 
@@ -77,27 +78,40 @@ def _bare(s: Support) -> Support:
 def renamed(graph: SupportGraph, names: Mapping[str, str]) -> SupportGraph:
     """Return a graph of one view with other names, old id → new id; of two with the same new id, one stays.
 
-    A support between two equal ids is dropped.
+    A support between two equal ids is dropped. Texts name the new ids.
     """
+    known = re.compile(rf"\b({'|'.join(map(re.escape, names))})\b" if names else r"(?!)")
+
+    def told(text: str) -> str:
+        return known.sub(lambda found: names[found[0]], text)
+
     objects: dict[str, SceneObject] = {}
     for o in graph.objects:
         new_id = names.get(o.id, o.id)
         named = o if new_id == o.id else replace(o, id=new_id, label=label_of(new_id))
+        if o.doubt:
+            named = _without_doubts(replace(named, doubt=told(o.doubt)), {new_id})
         objects.setdefault(new_id, named)
     supports: dict[Pair, Support] = {}
     for s in graph.supports:
         a, b = (names.get(i, i) for i in s.pair)
         if a != b:
-            supports[a, b] = replace(s, supporter=a, supported=b)
+            supports[a, b] = replace(s, supporter=a, supported=b, why=told(s.why))
     stability = {names.get(i, i): verdict for i, verdict in graph.stability.items()}
     return SupportGraph(tuple(objects.values()), tuple(supports.values()), stability)
 
 
 def without(graph: SupportGraph, ids: Set[str]) -> SupportGraph:
-    """Return a graph without some objects and their supports."""
-    objects = tuple(o for o in graph.objects if o.id not in ids)
+    """Return a graph without some objects, their supports, and the doubts that name them."""
+    objects = tuple(_without_doubts(o, ids) for o in graph.objects if o.id not in ids)
     supports = tuple(s for s in graph.supports if ids.isdisjoint(s.pair))
     return SupportGraph(objects, supports, {i: v for i, v in graph.stability.items() if i not in ids})
+
+
+def _without_doubts(o: SceneObject, ids: Set[str]) -> SceneObject:
+    """An object without the doubts that name some ids."""
+    doubt = "; ".join(d for d in o.doubt.split("; ") if ids.isdisjoint(d.split()))
+    return o if doubt == o.doubt else replace(o, doubt=doubt)
 
 
 def fused_graph(
@@ -144,7 +158,8 @@ def fused_graph(
             last = replace(last, probability=(1.0 - _EARLIER) * last.probability + _EARLIER * before)
         if last.belief >= LIKELY:
             supports.append(replace(last, occurrences=occurrences, opportunities=len(views)))
-    return arrange_graph(objects.values(), supports)
+    gone = {i for i in sightings if i not in objects}
+    return arrange_graph((_without_doubts(o, gone) for o in objects.values()), supports)
 
 
 def find_views_showing(graphs: Graphs, shown: Sequence[frozenset[str]] | None) -> dict[str, set[int]]:

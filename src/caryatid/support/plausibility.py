@@ -169,9 +169,12 @@ def _changed(shape: Shape, change: Array) -> Shape:
 
 
 def _doubts(objects: Sequence[SceneObject], contacts: Sequence[Contact]) -> dict[int, str]:
-    """The doubts about objects of contacts that uncertainty does not explain."""
+    """The doubts about objects of contacts that uncertainty does not explain; of two, the largest."""
     doubts: dict[int, str] = {}
-    for c in contacts:
+    largest: dict[tuple[int, int], Contact] = {}
+    for c in sorted(contacts, key=lambda c: -abs(c.distance)):  # each of their convex parts has its own
+        largest.setdefault((c.a, c.b), c)
+    for c in sorted(largest.values(), key=lambda c: (c.a, c.b)):
         for k, other in ((c.a, c.b), (c.b, c.a)):
             if objects[k].role == "support_surface":
                 continue

@@ -143,7 +143,7 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
         known = edge.probability is not None
         return f"{edge.why} Probability {edge.probability:.2f}." if known else edge.why
     if graph.objects[b].role == "support_surface":
-        return f"{supported} is the support surface: nothing supports it."
+        return f"{supported} is a support surface: nothing supports it."
     contact = nearest_contacts(graph.objects, touching(graph.objects, config.reach)).get((a, b))
     head = f"{supporter} does not support {supported}"
     if contact is None:
@@ -175,11 +175,11 @@ def removal_of(graph: SupportGraph, object_id: str, config: SupportConfig) -> Re
         The removal.
 
     Raises:
-        InputError: There is no such object, or it is the support surface.
+        InputError: There is no such object, or it is a support surface.
     """
     index = _index(graph, object_id)
     if graph.objects[index].role == "support_surface":
-        raise InputError(object_id, "is the support surface", "ask about one of the objects on it")
+        raise InputError(object_id, "is a support surface", "ask about one of the objects on it")
     beliefs = np.full(len(graph.objects), np.nan)
     for s in graph.supports:
         if s.supporter == object_id:
