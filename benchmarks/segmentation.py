@@ -30,8 +30,7 @@ from caryatid.config.settings import read_settings
 from caryatid.errors import CaryatidError
 from caryatid.evaluation.oracle import spread_out
 from caryatid.evaluation.scores import assign, mask_ious
-from caryatid.segmentation.observation import observe
-from caryatid.segmentation.segments import segment
+from caryatid.segmentation.observation import observe, segment_view
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import View
 from caryatid.sources import open_source
@@ -74,11 +73,11 @@ class Segmentation(Gated, Simulated):
         config, rows = read_settings(None, self.set), []
         for number, view in enumerate(self.views_of(source, config)):
             rng = np.random.default_rng(self.seed)
-            seen = observe(view, config, segmentation="auto", known=None, rng=rng)
+            seen = observe(view, config, segmentation="auto", known=(), rng=rng)
             if seen.view is None or view.labels is None:
                 raise CaryatidError(f"{view.name}: has no masks to compare with")
             started = time.perf_counter()
-            labels = segment(seen.view, seen.surface, config.segmentation, config.cloud, config.fit, rng)[0]
+            labels = segment_view(seen.view, seen.surfaces, config, rng)[0]
             known = {"source": Path(source).name, "view": number, "seconds": time.perf_counter() - started}
             rows.append(known | compare(labels[view.valid], view.labels[view.valid]))
         return rows

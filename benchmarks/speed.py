@@ -35,8 +35,8 @@ from caryatid.planning.planners import make_planner
 from caryatid.planning.points_of_interest import points_of_interest
 from caryatid.robots import Robot
 from caryatid.runtime.parallel import one_blas_thread
-from caryatid.segmentation.segments import segment
-from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
+from caryatid.segmentation.observation import segment_view
+from caryatid.segmentation.support_plane import SupportSurface, find_support_surfaces
 from caryatid.sensing.clouds import oriented_points
 from caryatid.sensing.view_sphere import ViewSphere, direction
 from caryatid.sensing.voxel_map import VoxelMap
@@ -245,15 +245,15 @@ def _stages(recording: Recording, later: dict[str, list[Laps]], effort: Effort) 
     loose = np.flatnonzero(view.labels.ravel()[pixels] == 0)
     loose = loose[:: max(1, len(loose) // 20_000)]
 
-    def surface() -> SupportSurface:
+    def surfaces() -> list[SupportSurface]:
         rng = np.random.default_rng(0)
-        return find_support_surface(points[loose], normals[loose], UP, config.surface, rng)
+        return find_support_surfaces(points[loose], normals[loose], UP, config.surface, rng)
 
-    found = surface()
+    found = surfaces()
 
     def segments() -> object:
         rng = np.random.default_rng(0)
-        return segment(fresh(view, labels=False), found, config.segmentation, config.cloud, config.fit, rng)
+        return segment_view(fresh(view, labels=False), found, config, rng)
 
     # Depth in; position, normal and pixel of each point out; six running sums and three unknowns per pixel.
     size = view.depth.size
@@ -262,7 +262,7 @@ def _stages(recording: Recording, later: dict[str, list[Laps]], effort: Effort) 
         "points": (
             "oriented points of a view", lambda: oriented_points(fresh(view), config.cloud), of_points,
         ),
-        "surface": ("support surface among them", surface, (48.0 * len(loose), 0.0)),
+        "surface": ("support surfaces among them", surfaces, (48.0 * len(loose), 0.0)),
         "parts": ("automatic segments of a view", segments, (8.0 * size, 0.0)),
     }  # fmt: skip
     rows = [

@@ -18,7 +18,7 @@ UNKNOWN = VoxelMap.around(CENTRE, VoxelConfig())
 
 
 def completed(*objects, voxels=UNKNOWN, surface=None):
-    return complete(objects, surface or surface_at(), voxels, CONFIG)
+    return complete(objects, [surface or surface_at()], voxels, CONFIG)
 
 
 def lowest(shape):

@@ -217,7 +217,7 @@ CONFIG = Config()
 VIEW = simulated_views("tower")[0]
 
 
-def observation_of(source, segmentation=None, known=None, config=CONFIG):
+def observation_of(source, segmentation=None, known=(), config=CONFIG):
     return observe(source, config, segmentation=segmentation, known=known, rng=np.random.default_rng(0))
 
 

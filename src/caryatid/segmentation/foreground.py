@@ -85,7 +85,7 @@ def find_foreground(
     highest = np.lexsort((height, index))[np.cumsum(sizes) - 1]
     row, column = np.divmod(rows[highest], body.shape[1])
     above = inverse_depth[np.maximum(row - 1 - np.arange(3)[:, None], 0), column]
-    hidden = (above > inverse_depth[row, column] + jump).any(axis=0)
+    hidden = np.any(above > inverse_depth[row, column] + jump, axis=0)
     unfit |= find_furniture(points, index, stands_on, surfaces, config, hidden)
     lost = np.isin(body, names[unfit]).repeat(step, 0).repeat(step, 1)
     owner[lost[: owner.shape[0], : owner.shape[1]]] = 0
@@ -106,16 +106,16 @@ def find_foreground(
 
 def find_furniture(
     points_world: Array,
-    part: NDArray[np.intp],
-    stands_on: NDArray[np.intp],
+    part: NDArray[np.integer],
+    stands_on: NDArray[np.integer],
     surfaces: Sequence[SupportSurface],
     config: SegmentationConfig,
     hidden: Mask,
 ) -> Mask:
     """Find the parts of a view that are legs, walls or uprights of surfaces, and no objects.
 
-    In plan, these are under a higher surface, partly along its border, and reach up to it, or as far as can be
-    seen; or a long one is close to the border of its own surface.
+    In plan, these are under a higher surface, partly along its border, and reach up to it, or as far as can
+    be seen; or a long one is close to the border of its own surface.
 
     Args:
         points_world: Points (N, 3) [m].

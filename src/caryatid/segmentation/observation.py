@@ -152,7 +152,7 @@ def observe(
     if given is not None:
         labels = given
     elif isinstance(source, View):
-        image, apart = _segment_all(source, surfaces, config, rng)
+        image, apart = segment_view(source, surfaces, config, rng)
         labels = image.ravel()[pixels]
     else:
         labels = segment_cloud(cloud, surfaces[0], config.segmentation)
@@ -164,10 +164,17 @@ def observe(
     return Observation(view, replace(cloud, labels=labels), pixels, surfaces, apart)
 
 
-def _segment_all(
+def segment_view(
     view: View, surfaces: Sequence[SupportSurface], config: Config, rng: np.random.Generator
 ) -> tuple[Labels, Pairs]:
-    """Cut a view into the segments on all surfaces; the result is that of `segment`."""
+    """Cut a view into the segments on all surfaces; the result is that of `segment`.
+
+    Args:
+        view: The view, which has a pose.
+        surfaces: The support surfaces, the main one first.
+        config: All settings.
+        rng: Draws the samples of fits.
+    """
     reach = min(config.voxels.extent[:2]) / 2.0
     foregrounds = find_foreground(view, surfaces, config.segmentation, reach)
     image, pairs = np.zeros(view.depth.shape, dtype=np.int32), [np.empty((0, 2), dtype=np.int32)]
