@@ -22,7 +22,6 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Sphere
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.io.staging import write_file
-from caryatid.planning.decision import Decision
 from caryatid.sensing.views import View
 from caryatid.steps import RunWriter, read_run
 
@@ -172,10 +171,9 @@ def test_a_folder_that_holds_what_no_run_wrote_is_never_touched(tmp_path, name):
 
 
 def test_a_continued_run_keeps_its_scores(tmp_path):
-    going_on = replace(step(), decision=Decision(T, 0, 0.0, 0.0, 0.0, "more to see"))
-    for last, f1 in ((going_on, 0.25), (step(2), 0.5)):
-        with RunWriter(tmp_path / "RUN", Config(), ABOUT, stepwise=True) as run:
-            run.add(last, scored(f1))
+    RunWriter(tmp_path / "RUN", Config(), ABOUT, stepwise=True).add(step(), scored(0.25))  # then it is killed
+    with RunWriter(tmp_path / "RUN", Config(), ABOUT, stepwise=True) as run:
+        run.add(step(2), scored(0.5))
     assert read_run(tmp_path / "RUN").record["scores"] == [scored(0.25), scored(0.5)]
 
 
@@ -238,7 +236,7 @@ RECORD = ABOUT | {"format": "caryatid/run", "version": 2, "views": 2}
         ("run.json", {"date": 2026}, "'date' is 2026"),
         ("run.json", {"scores": [{}, {}]}, "scores.0: the key 'f1' is missing"),
         ("run.json", {"scores": [scored(1.0)]}, "the number of scores, 1"),
-        ("graph.json", b"{}", "'format' is missing"),
+        ("views/01/graph.json", b"{}", "'format' is missing"),
         ("views/01/graph.json", None, "missing"),
         ("views/01/view.json", b"{}", "'name' is missing"),
         ("views/01/labels.png", None, "missing"),
