@@ -21,7 +21,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Sphere
 from caryatid.graph import SceneObject, SupportGraph
-from caryatid.io.staging import write_file
+from caryatid.io.staging import recover, write_file
 from caryatid.sensing.views import View
 from caryatid.steps import RunWriter, read_run
 
@@ -140,19 +140,23 @@ def test_an_older_run_is_replaced_at_the_end_and_not_before(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["RUN"]
 
 
-def test_what_a_killed_process_left_is_recovered_or_removed(tmp_path):
+@pytest.mark.parametrize("same_id", [False, True])
+def test_what_a_killed_process_left_is_recovered_or_removed(tmp_path, same_id):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
+    pid = os.getpid() if same_id else dead.pid
     write_run(tmp_path / "RUN", views=1, seed=1)
-    (tmp_path / "RUN").rename(tmp_path / f".partial-RUN-{dead.pid}-0123abcd-replaced")
-    (tmp_path / f".partial-RUN-{dead.pid}-0123abcd").mkdir()
-    (tmp_path / f".partial-RUN-{os.getpid()}-0123abcd").mkdir()
+    (tmp_path / "RUN").rename(tmp_path / f".partial-RUN-{pid}-0123abcd-replaced")
+    (tmp_path / f".partial-RUN-{pid}-0123abcd").mkdir()
+    (tmp_path / f".partial-RUN-{os.getppid()}-0123abcd").mkdir()
     assert read_run(tmp_path / "RUN").record["seed"] == 1
-    left = {"RUN", f".partial-RUN-{os.getpid()}-0123abcd"}
+    left = {"RUN", f".partial-RUN-{os.getppid()}-0123abcd"}
     assert {p.name for p in tmp_path.iterdir()} == left
-    (tmp_path / f".partial-RUN-{dead.pid}-4567cdef").mkdir()
-    (tmp_path / f".partial-a.pdf-{dead.pid}-0123abcd").touch()
-    with writer(tmp_path / "RUN", seed=2):
+    (tmp_path / f".partial-RUN-{pid}-4567cdef").mkdir()
+    (tmp_path / f".partial-a.pdf-{pid}-0123abcd").touch()
+    with writer(tmp_path / "RUN", seed=2) as run:
+        recover(tmp_path / "RUN")
+        run.add(step())  # into the folder that this process is writing
         write_file(tmp_path / "a.pdf", b"%PDF")
     assert {p.name for p in tmp_path.iterdir()} == left | {"a.pdf"}
 
