@@ -279,14 +279,18 @@ def kill_clearing(folder: Path, _: Sequence[View], kills: int, seed: int) -> Cou
     took, whole = time.monotonic() - begun, read_run(folder / "whole")
     out, known = folder / "runs" / "run", 0
     while tally["killed"] < kills:
-        ended = stop(start([*words, out], said), said, chance.uniform(0.0, 0.6) * took)
-        tally["ended" if ended else "killed"] += 1
-        found = len(read_run(out).views) if out.exists() else 0
+        exited = stop(start([*words, out], said), said, chance.uniform(0.0, 0.6) * took)
+        tally["exited" if exited else "killed"] += 1
+        run = read_run(out) if out.exists() else None
+        found, ended = (len(run.views), "unfinished" not in run.record) if run else (0, False)
         assert found >= known, "stored views are lost"
+        assert ended or not exited, "the run of a command that has exited is unfinished"
         known = found
         if ended:
             assert os.listdir(out.parent) == ["run"], "other files remain after the run"
             assert read_run(out).record["lifts"] == whole.record["lifts"], "the lifts differ"
+            # The result was printed, so the same command would begin a new run.
+            tally["ended"] += 1
             out, known = folder / f"runs-{tally['ended']}" / "run", 0
     return tally
 

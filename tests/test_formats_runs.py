@@ -21,8 +21,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Sphere
 from caryatid.graph import SceneObject, SupportGraph
-from caryatid.io.staging import write_file
-from caryatid.planning.decision import Decision
+from caryatid.io.staging import recover, write_file
 from caryatid.sensing.views import View
 from caryatid.steps import RunWriter, read_run
 
@@ -141,19 +140,23 @@ def test_an_older_run_is_replaced_at_the_end_and_not_before(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["RUN"]
 
 
-def test_what_a_killed_process_left_is_recovered_or_removed(tmp_path):
+@pytest.mark.parametrize("same_id", [False, True])
+def test_what_a_killed_process_left_is_recovered_or_removed(tmp_path, same_id):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
+    pid = os.getpid() if same_id else dead.pid
     write_run(tmp_path / "RUN", views=1, seed=1)
-    (tmp_path / "RUN").rename(tmp_path / f".partial-RUN-{dead.pid}-0123abcd-replaced")
-    (tmp_path / f".partial-RUN-{dead.pid}-0123abcd").mkdir()
-    (tmp_path / f".partial-RUN-{os.getpid()}-0123abcd").mkdir()
+    (tmp_path / "RUN").rename(tmp_path / f".partial-RUN-{pid}-0123abcd-replaced")
+    (tmp_path / f".partial-RUN-{pid}-0123abcd").mkdir()
+    (tmp_path / f".partial-RUN-{os.getppid()}-0123abcd").mkdir()
     assert read_run(tmp_path / "RUN").record["seed"] == 1
-    left = {"RUN", f".partial-RUN-{os.getpid()}-0123abcd"}
+    left = {"RUN", f".partial-RUN-{os.getppid()}-0123abcd"}
     assert {p.name for p in tmp_path.iterdir()} == left
-    (tmp_path / f".partial-RUN-{dead.pid}-4567cdef").mkdir()
-    (tmp_path / f".partial-a.pdf-{dead.pid}-0123abcd").touch()
-    with writer(tmp_path / "RUN", seed=2):
+    (tmp_path / f".partial-RUN-{pid}-4567cdef").mkdir()
+    (tmp_path / f".partial-a.pdf-{pid}-0123abcd").touch()
+    with writer(tmp_path / "RUN", seed=2) as run:
+        recover(tmp_path / "RUN")
+        run.add(step())  # into the folder that this process is writing
         write_file(tmp_path / "a.pdf", b"%PDF")
     assert {p.name for p in tmp_path.iterdir()} == left | {"a.pdf"}
 
@@ -172,10 +175,9 @@ def test_a_folder_that_holds_what_no_run_wrote_is_never_touched(tmp_path, name):
 
 
 def test_a_continued_run_keeps_its_scores(tmp_path):
-    going_on = replace(step(), decision=Decision(T, 0, 0.0, 0.0, 0.0, "more to see"))
-    for last, f1 in ((going_on, 0.25), (step(2), 0.5)):
-        with RunWriter(tmp_path / "RUN", Config(), ABOUT, stepwise=True) as run:
-            run.add(last, scored(f1))
+    RunWriter(tmp_path / "RUN", Config(), ABOUT, stepwise=True).add(step(), scored(0.25))  # then it is killed
+    with RunWriter(tmp_path / "RUN", Config(), ABOUT, stepwise=True) as run:
+        run.add(step(2), scored(0.5))
     assert read_run(tmp_path / "RUN").record["scores"] == [scored(0.25), scored(0.5)]
 
 
@@ -238,7 +240,7 @@ RECORD = ABOUT | {"format": "caryatid/run", "version": 2, "views": 2}
         ("run.json", {"date": 2026}, "'date' is 2026"),
         ("run.json", {"scores": [{}, {}]}, "scores.0: the key 'f1' is missing"),
         ("run.json", {"scores": [scored(1.0)]}, "the number of scores, 1"),
-        ("graph.json", b"{}", "'format' is missing"),
+        ("views/01/graph.json", b"{}", "'format' is missing"),
         ("views/01/graph.json", None, "missing"),
         ("views/01/view.json", b"{}", "'name' is missing"),
         ("views/01/labels.png", None, "missing"),

@@ -463,6 +463,7 @@ class TestCommands:
     @pytest.mark.parametrize(
         ("name", "segmentation", "why", "views"),
         [("clear", "labels", "is not an object of the scene; known objects: o1, o2", None),
+         ("clear", "auto", "was not found in 2 views; objects found: o1", 2),
          ("explore", "auto", "was not found in 2 views; objects found: o1", 2)],
     )  # fmt: skip
     def test_an_unknown_goal_is_an_error(self, name, segmentation, why, views, scene_file, tmp_path, capsys):
@@ -471,7 +472,9 @@ class TestCommands:
         assert run_command(*command, *SMALL) == 4
         assert capsys.readouterr() == ("", f"error: --goal o99: {why}\n")
         assert (tmp_path / "run").exists() == (views is not None)
-        assert views is None or len(read_run(tmp_path / "run").views) == views
+        if views is not None:
+            run = read_run(tmp_path / "run")
+            assert (len(run.views), "unfinished" in run.record) == (views, False)
 
     @pytest.mark.parametrize(("segmentation", "first"), [("labels", "o4"), ("auto", None)])
     def test_a_goal_that_no_view_shows_is_uncovered_where_labels_can_name_it(self, segmentation, first):

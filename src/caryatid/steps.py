@@ -20,7 +20,7 @@ from pydantic import PositiveInt
 
 from caryatid.config import Config
 from caryatid.config.settings import changed_settings
-from caryatid.errors import InputError
+from caryatid.errors import GoalError, InputError
 from caryatid.exploration import RobotPose, Step
 from caryatid.graph import Change, Grasp, SupportGraph, TakeStep
 from caryatid.io import images
@@ -54,8 +54,9 @@ PARTS = (
 class RunWriter(StagedFolder):
     """Writes a run folder step by step in a `with` block; the folder appears at the end of the block.
 
-    Ctrl-C also ends the block, and keeps the views so far. Any other error leaves nothing behind. An earlier
-    run folder is replaced only at the end of the block. A folder with other files is never changed.
+    Ctrl-C also ends the block, and keeps the views so far. A goal that no view shows ends it too. Any other
+    error leaves nothing behind. An earlier run folder is replaced only when this one appears. A folder with
+    other files is never changed.
 
     A run is what its run.json says, which is written last: what a kill leaves beside it does not count.
 
@@ -64,7 +65,7 @@ class RunWriter(StagedFolder):
         config: All settings.
         about: Further entries of run.json: command, source, seed, options.
         stepwise: Publish the folder with the first view and add view by view, so that a kill keeps the views
-            so far. An unfinished run of this kind is continued.
+            so far. The end of the block finishes the run; an unfinished one is continued.
 
     Attributes:
         past: The run that this one continues, or None.
@@ -125,14 +126,16 @@ class RunWriter(StagedFolder):
         self._scores += [] if score is None else [score]
         self.files["graph.json"] = graph
         if self._stepwise:
-            self._finish({"unfinished": True} if step.decision is not None else {})
+            self._finish({"unfinished": True})
 
     def __exit__(self, kind: object = BaseException, *error: object) -> None:
-        """Write the rest and publish the folder; after an error other than Ctrl-C, remove it."""
+        """Write the rest and publish the folder; after an error, remove what is not published."""
         interrupted = kind is KeyboardInterrupt and len(self.steps) > 0
         try:
-            if (interrupted or (kind is None and self.steps)) and not self._stepwise:
-                self._finish({"interrupted": True} if interrupted else {})
+            if kind in (None, GoalError) and self.steps:
+                self._finish({})
+            elif interrupted and not self._stepwise:
+                self._finish({"interrupted": True})
         finally:
             super().__exit__()
         if interrupted:
@@ -284,7 +287,7 @@ def read_run(folder: str | Path) -> Run:
     if file.scores and len(file.scores) != file.views:
         raise InputError(path, f"the number of scores, {len(file.scores)}, is not that of views", AGAIN)
     views = tuple(RunView(folder / _view_folder(index)) for index in range(file.views))
-    return Run(folder, record, read_graph(folder / "graph.json"), views)
+    return Run(folder, record, views[-1].graph, views)  # graph.json may be newer than run.json after a kill
 
 
 def read_steps(run: Run) -> Iterator[Step]:

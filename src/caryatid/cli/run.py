@@ -136,24 +136,25 @@ def clear_table(command: Clear) -> int:
             reachable=reachable, past=() if writer.past is None else read_steps(writer.past),
         )  # fmt: skip
         last = _record(command, writer, source.name, steps)
-    _draw_report(command)
-    if not lifts.done:
-        _check_found(command.goal, last)
-    left, harmed = lifts.hands.left, sorted({body for lift in lifts.done for body in lift["disturbed"]})
-    gone = {lift["object"] for lift in lifts.done if lift["body"] is not None}
-    success = not harmed and (command.goal in gone if command.goal else not left)
-    taken = [{name: value for name, value in lift.items() if name != "state"} for lift in lifts.done]
-    document = {"run": str(command.out), "success": success, "stop": last.stop, "views": last.index + 1}
-    document |= {"steps": taken, "left": left, "warnings": output.warnings}
-    rows = [
-        (str(number), lift["object"], lift["body"] or "nothing there", ", ".join(lift["held"]) or "–",
-         ", ".join(lift["disturbed"]) or "–", lift["why"])
-        for number, lift in enumerate(taken, start=1)
-    ]  # fmt: skip
-    outcome = f"{', '.join(harmed)} disturbed" if harmed else "nothing disturbed"
-    title = f"{source.name}: {last.stop}; {count_of(last.index + 1, 'view')}, {outcome}"
-    output.result(document, table(title, ("", "remove", "body", "hold", "disturbed", "reason"), rows))
-    return 0 if success else NOT_SAFE
+        # The run stays unfinished until its result is printed, so that after a kill the command continues.
+        _draw_report(command)
+        if not lifts.done:
+            _check_found(command.goal, last)
+        left, harmed = lifts.hands.left, sorted({body for lift in lifts.done for body in lift["disturbed"]})
+        gone = {lift["object"] for lift in lifts.done if lift["body"] is not None}
+        success = not harmed and (command.goal in gone if command.goal else not left)
+        taken = [{name: value for name, value in lift.items() if name != "state"} for lift in lifts.done]
+        document = {"run": str(command.out), "success": success, "stop": last.stop, "views": last.index + 1}
+        document |= {"steps": taken, "left": left, "warnings": output.warnings}
+        rows = [
+            (str(number), lift["object"], lift["body"] or "nothing there", ", ".join(lift["held"]) or "–",
+             ", ".join(lift["disturbed"]) or "–", lift["why"])
+            for number, lift in enumerate(taken, start=1)
+        ]  # fmt: skip
+        outcome = f"{', '.join(harmed)} disturbed" if harmed else "nothing disturbed"
+        title = f"{source.name}: {last.stop}; {count_of(last.index + 1, 'view')}, {outcome}"
+        output.result(document, table(title, ("", "remove", "body", "hold", "disturbed", "reason"), rows))
+        return 0 if success else NOT_SAFE
 
 
 class RecordedLifts:

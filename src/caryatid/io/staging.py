@@ -23,6 +23,8 @@ from caryatid.errors import InputError
 
 PARTIAL, REPLACED = ".partial-", "-replaced"
 """Prefix of staged files and folders, suffix of those being replaced; a killed process leaves them."""
+PROCESS: Final = secrets.token_hex(4)
+"""Tells this process from a killed one with the same id: in a container, each has the same."""
 LATER: Final = "delete this line and all later ones"
 """Remedy for a damaged line."""
 
@@ -154,15 +156,15 @@ def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
 
 def recover(place: Path) -> None:
     """Remove staged files of killed processes in and beside a folder; restore it if it was being replaced."""
-    staged = re.compile(rf"{re.escape(PARTIAL)}(.+)-(\d+)-[0-9a-f]{{8}}({REPLACED})?")
+    staged = re.compile(rf"{re.escape(PARTIAL)}(.+)-(\d+)-([0-9a-f]{{8}})[0-9a-f]*({REPLACED})?")
     with suppress(OSError):
         for path in (*place.parent.glob(f"{PARTIAL}*"), *place.rglob(f"{PARTIAL}*")):
             found = staged.fullmatch(path.name)
-            if found is None or _runs(int(found[2])):
+            if found is None or _runs(int(found[2]), found[3]):
                 continue
             if path.parent == place.parent and found[1] != place.name:
                 continue
-            if found[3] and not place.exists():
+            if found[4] and not place.exists():
                 path.rename(place)
             elif path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
@@ -213,11 +215,13 @@ def sync(path: Path) -> None:
 
 
 def _partial(path: Path) -> Path:
-    return path.with_name(f"{PARTIAL}{path.name}-{os.getpid()}-{secrets.token_hex(4)}")
+    return path.with_name(f"{PARTIAL}{path.name}-{os.getpid()}-{PROCESS}{secrets.token_hex(4)}")
 
 
-def _runs(process: int) -> bool:
+def _runs(process: int, token: str) -> bool:
     """Whether a process may still run; false only if it certainly does not."""
+    if process == os.getpid():
+        return token == PROCESS
     try:
         os.kill(process, 0)
     except ProcessLookupError:

@@ -56,7 +56,7 @@ def clear(
     Yields:
         A step after each view and its lift; `lift` names the removed object, which the graph holds until the
         next view, or not if there is none. The last one again, with `stop`, if the robot can go to no further
-        view.
+        view, or if it is the last of `past`.
 
     Raises:
         CaryatidError: A view cannot be used.
@@ -70,6 +70,8 @@ def clear(
             explorer.scene.removed(step.lift.object_id)
         explorer.step = step
         views = 0 if step.lift is not None else views + 1
+    if explorer.step is not None and explorer.step.decision is None:
+        yield explorer.step
     while explorer.step is None or explorer.step.decision is not None:
         if explorer.step is not None and (step := explorer.go()).stop is not None:
             yield step
