@@ -113,7 +113,7 @@ def surface_at(height: float = TABLE_TOP) -> SupportSurface:
     top = box((0.0, 0.0, height - 0.02), (0.7, 1.0, 0.04))
     middle = np.array([0.0, 0.0, height])
     region = Region(np.array([-18, -25]), np.ones((36, 50), dtype=np.bool_), 0.02)
-    return SupportSurface(np.array([0.0, 0.0, 1.0]), middle, corners, top, region)
+    return SupportSurface(np.array([0.0, 0.0, 1.0]), middle, corners, top, region, region)
 
 
 def random_motion(rng: np.random.Generator, reach: float = 1.0) -> Array:

@@ -12,7 +12,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Sphere
 from caryatid.sensing.clouds import estimate_normals, oriented_points
 from caryatid.sensing.masks import labels_from_masks
-from caryatid.sensing.views import SUPPORT_LABEL, View
+from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, View
 from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
 
 # Views
@@ -65,9 +65,9 @@ def test_a_view_that_makes_no_sense_is_refused_by_name_and_reason(fields, reason
 
 
 def test_the_highest_label_below_the_support_surfaces_is_allowed_and_a_missing_pose_is_asked_for_by_name():
-    view = View(DEPTH, K, labels=np.full((4, 5), SUPPORT_LABEL - 1, dtype=np.uint16), name="frame 3")
+    view = View(DEPTH, K, labels=np.full((4, 5), MAX_LABEL, dtype=np.uint16), name="frame 3")
     assert view.labels.dtype == np.int32
-    assert (view.labels == SUPPORT_LABEL - 1).all()
+    assert (view.labels == MAX_LABEL).all()
     with pytest.raises(InputError, match="frame 3: has no camera pose"):
         _ = view.pose
 

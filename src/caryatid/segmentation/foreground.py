@@ -69,7 +69,7 @@ def find_foreground(
         """Share of the samples of each body."""
         return np.asarray(np.bincount(index, which, len(names)) / sizes)
 
-    meeting = _count_meeting(body, owner[grid], level[grid], inverse_depth, jump)[names]
+    meeting = find_meeting(body, owner[grid], level[grid], inverse_depth, jump)[names]
     near = np.linalg.norm(points[:, :2] - surfaces[0].point_world[:2], axis=1) < reach
     inner = np.zeros(body.shape, dtype=np.bool_)
     inner[1:-1, 1:-1] = True
@@ -165,7 +165,7 @@ def _is_layer(view: View, level: Mask, surface: SupportSurface, config: Segmenta
 
 
 @kernel
-def _count_meeting(body, owner, level, inverse_depth, jump):  # type: ignore[no-untyped-def]
+def find_meeting(body, owner, level, inverse_depth, jump):  # type: ignore[no-untyped-def]
     """In how many places (H·W,) each body meets readings of its own surface, without a jump of 1/z [1/m].
 
     Bodies (H, W) are those of `find_bodies`; owner and level (H, W) are the numbers of the surfaces that a

@@ -286,7 +286,7 @@ def level_transform(
     """
     source = thinned(source, config.cloud)
     cloud, pixels = _points(source, config)
-    pose = np.eye(4) if isinstance(source, View) else None
+    pose = np.eye(4)  # the source is in the frame of its camera
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     if given is not None:
         given = _without_table(cloud, given, (), None, config, rng, pose)

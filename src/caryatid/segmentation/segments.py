@@ -80,7 +80,7 @@ def segment(
     wide = wide_parts(samples.image(part))
     # Something beside the surface or in the room behind is not an object on it; nor is a wall at its edge,
     # which begins where the readings of the surface end. Of a board that a weight holds, most may be outside.
-    over = surface.pixels_over(view, 0.0, np.inf, -surface.region.size)[samples.grid][samples.places]
+    over = surface.pixels_over(view, 0.0, np.inf, -surface.core.size, core=True)[samples.grid][samples.places]
     proper = wide[part]
     part = _with_share(np.where(proper, part, 0), over, 0.2)
     uncut, width = samples.image(part), GAP // config.stride

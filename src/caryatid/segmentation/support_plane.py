@@ -129,13 +129,15 @@ class SupportSurface:
         point_world: Centroid of the inliers, moved onto the plane (3,) [m].
         outline_world: Convex hull (M, 3) of the inliers on the plane [m], counter-clockwise seen from above.
         shape: Thin box whose top face is the smallest rectangle around the outline; its z is the normal.
-        region: Where it was seen, and where something in front of it hides what goes on there.
+        core: Where it was seen, and what lies between.
+        region: The core, and where something in front of it hides whether it goes on.
     """
 
     normal_world: Array
     point_world: Array
     outline_world: Array
     shape: Box
+    core: Region
     region: Region
 
     @property
@@ -160,14 +162,18 @@ class SupportSurface:
         height = self.height(points_world)
         return (low < height) & (height < high) & self.region.grown(margin).holds(points_world)
 
-    def pixels_over(self, view: View, low: float, high: float, margin: float = np.inf) -> Mask:
+    def pixels_over(
+        self, view: View, low: float, high: float, margin: float = np.inf, *, core: bool = False
+    ) -> Mask:
         """Which pixels (H, W) of a view, which has a pose, show something between two heights [m] over it.
 
-        The margin is as for `over`; if it is infinite, anything above or below counts.
+        The margin is as for `over`, beyond the region or its core; if it is infinite, anything above or below
+        counts.
         """
         x, y = ((np.arange(n) - view.K[k, 2]) / view.K[k, k] for k, n in enumerate(view.depth.shape[::-1]))
         T, everywhere = np.ascontiguousarray(view.pose), margin == np.inf
-        own = self.region if everywhere else self.region.grown(margin)
+        own = self.core if core else self.region
+        own = own if everywhere else own.grown(margin)
         grid = own.squares, own.corner, own.size
         return _pixels_over(view.depth, x, y, T, self._plane, everywhere, *grid, low, high)
 
@@ -182,7 +188,7 @@ class SupportSurface:
         It goes on as far as a gap of the configuration where the view shows the surface, or something nearer
         in its place. Places without a reading belong to it if they are between those that do.
         """
-        wide = self.region.grown(config.gap)
+        wide = self.core.grown(config.gap)
         if self.height(view.pose[:3, 3]) <= 0.0:
             return self
         feet = wide.centres()
@@ -201,18 +207,24 @@ class SupportSurface:
         through, hidden = np.zeros((2, *wide.squares.shape), dtype=np.bool_)
         through.ravel()[inside] = (z > 0.0) & (eye * (1.0 - share) < -config.tolerance)
         hidden.ravel()[inside] = (z > 0.0) & (eye * (1.0 - share) > -config.tolerance)
-        seen = np.pad(self.region.squares, int(np.ceil(config.gap / wide.size)))
+        seen = np.pad(self.core.squares, int(np.ceil(config.gap / wide.size)))
         part, _ = ndimage.label(seen | (hidden & wide.squares))
         main = np.argmax(np.bincount(part[seen]))
         seen &= part == main
         corners = hull(np.argwhere(seen).astype(np.float64))
         whole = shapely.contains_xy(shapely.Polygon(corners), *np.indices(seen.shape)) & ~through
-        return replace(self, region=replace(wide, squares=(part == main) | whole))
+        region = replace(wide, squares=(part == main) | whole)
+        return replace(self, core=replace(wide, squares=whole), region=region)
 
     def continues(self, other: SupportSurface, config: SurfaceConfig) -> bool:
         """Whether it is a part of another surface, which noise or a tilt sets off."""
         near = other.region.grown(config.gap).holds(self.region.places())
         return bool(near.any() and abs(other.height(self.point_world)) < config.search)
+
+    def joined(self, known: SupportSurface) -> SupportSurface:
+        """Return the surface with the places where it was known."""
+        core = self.core.joined(known.core)
+        return replace(self, core=core, region=core)
 
     def moved(self, T: Array) -> SupportSurface:
         """Return the surface moved by a rigid transform (4, 4) of the world, by less than a square."""
@@ -391,7 +403,7 @@ def find_support_surfaces(
         near = left & (np.abs(height) < config.search) & wide.holds(points)
         plane = scene.largest_plane(_some(near, 5_000), rng)
         found = surface if plane is None else _surface(points, plane, config, surface.outline_world)
-        surfaces.append(replace(found, region=found.region.joined(surface.region)))
+        surfaces.append(found.joined(surface))
         left &= ~near
     planes: list[_Plane] = []
     left = _some(left, 5_000 if known else len(points))
@@ -401,14 +413,14 @@ def find_support_surfaces(
     if not known and not planes:
         raise NoSurfaceError(f"no support surface: {_tried(scene, rng, T_world_camera)}")
     if not known:
-        weights = np.ones(len(points))
+        weights = None
         if T_world_camera is not None:
             rays = transforms.unit(points - T_world_camera[:3, 3])
             away = np.degrees(np.arccos(np.clip(rays @ T_world_camera[:3, 2], -1.0, 1.0)))
             weights = np.exp(-0.5 * (away / MIDDLE) ** 2)
         main = _choose_table(planes, points, weights, config)
         surfaces.append(_surface(points, planes.pop(main), config))
-    for plane in (part for plane in planes for part in scene.parts(plane, 0.0)):
+    for plane in (part for whole in planes for part in scene.parts(whole, 0.0)):
         if len(surfaces) == SUPPORT_LABEL - MAX_LABEL:
             break
         with suppress(NoSurfaceError):  # The points may lie on a line.
@@ -470,19 +482,24 @@ def refitted(
     return None if plane is None else _surface(points, plane, config)
 
 
-def _choose_table(planes: list[_Plane], points: Array, weights: Array, config: SurfaceConfig) -> int:
+def _choose_table(planes: list[_Plane], points: Array, weights: Array | None, config: SurfaceConfig) -> int:
     """The number of the plane that most points (N, 3), by their weights (N,), are on or over.
 
-    A point belongs to the highest plane below it. Planes as large as furniture come first.
+    A point belongs to the highest plane below it. Without weights, only what stands on a plane counts, unless
+    it is below another, as legs are: a floor is larger than a table. Planes as large as furniture come first.
     """
-    heights = np.full((len(planes), len(points)), np.inf)
+    heights, below = np.full((len(planes), len(points)), np.inf), np.zeros(len(points), dtype=np.bool_)
     for k, plane in enumerate(planes):
         flat = points @ _basis(plane.normal).T
         own = Region.around(np.compress(plane.inliers, flat, axis=0), CELL).grown(2.0 * CELL).holds(flat)
         height = points @ plane.normal - plane.offset
         heights[k] = np.where(own & (height > -config.tolerance), height, np.inf)
-    above = np.isfinite(heights).any(axis=0)
-    shown = np.bincount(heights[:, above].argmin(axis=0), weights[above], minlength=len(planes))
+        below |= own & (height < -config.search)
+    least = heights.min(axis=0)
+    if weights is None:
+        weights = np.where((least > config.search) & ~below, 1.0, 0.01)
+    over = np.isfinite(least)
+    shown = np.bincount(heights[:, over].argmin(axis=0), weights[over], minlength=len(planes))
     return max(range(len(planes)), key=lambda k: (planes[k].area >= config.min_width**2, shown[k]))
 
 
@@ -514,7 +531,7 @@ def _surface(
     # If a cloud is not in metres, there are no more squares than memory holds.
     size = max(config.spacing, float(np.ptp(on_plane[:, :2], axis=0).max()) / 1000.0)
     region = Region.around(on_plane, size)
-    return SupportSurface(plane.normal, centroid, centroid + corners @ basis, box, region)
+    return SupportSurface(plane.normal, centroid, centroid + corners @ basis, box, region, region)
 
 
 def _basis(normal: Array) -> Array:
