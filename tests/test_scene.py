@@ -181,7 +181,7 @@ def cropped(view):
         (lambda view: view, ""),
         (near, "10000 readings nearer than cloud.min_depth = 0.1 m are ignored"),
         (without_depth, "too few depth readings in mask 1; its object is missed"),
-        (cropped, "the support surface has only 0.0"),
+        (cropped, "the support surface is only 0.19 m wide"),
         (
             lambda view: replace(view, K=np.diag([2.0, 2.0, 1.0]) @ view.K, T_world_camera=None),
             "is K for another resolution?",

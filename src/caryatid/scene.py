@@ -153,7 +153,9 @@ class Scene(Pictured):
     @property
     def cloud(self) -> Cloud:
         """All points so far, downsampled view by view, with the labels of their objects."""
-        return self._models.points.everything()
+        cloud = self._models.points.everything()
+        assert cloud.labels is not None
+        return cloud.select(self._shown_labels(cloud.labels) > 0)
 
     def __repr__(self) -> str:
         vertices, edges = len(self.graph.objects), len(self.graph.supports)
@@ -438,7 +440,7 @@ class Scene(Pictured):
         names = {k: self._ids.get(k, object_id(k)) for k in (*self._models.points.objects, *new)}
         present = {names[k] for k in self._models.points.objects}
         self._detector.record(self.views, missing, {names[k]: why for k, why in new.items()}, present)
-        self.labels = label_image(observation, source)
+        self.labels = self._shown_labels(label_image(observation, source))
         self.T_world_camera = None if observation.view is None else observation.view.T_world_camera
         if self.T_world_camera is not None:
             self.T_world_cameras = (*self.T_world_cameras, self.T_world_camera)
@@ -536,6 +538,12 @@ class Scene(Pictured):
             if len(own) >= config.min_points:
                 fused[k] = refitted(known, own.points_world, own.normals_world, UP, config) or known
         return tuple(fused)
+
+    def _shown_labels(self, labels: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Labels (...) with 0 for surfaces that carry nothing, which the graph lacks."""
+        lacking = [SUPPORT_LABEL - k for k in range(len(self.surfaces))]
+        known = {o.label for o in self.graph.support_surfaces}
+        return np.where(np.isin(labels, [k for k in lacking if k not in known]), np.int32(0), labels)
 
     def _carrying(self, observation: Observation) -> list[SupportSurface]:
         """The main surface, and those that carry something as far as is known."""

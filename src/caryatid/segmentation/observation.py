@@ -352,11 +352,13 @@ def _find_surfaces(
     index = np.flatnonzero(loose)
     some = cloud.select(index[:: max(1, len(index) // 20_000)])
     points, normals = some.points_world, some.normals_world
+    objects = cloud.points_world[~loose][:: max(1, len(index) // 20_000)]
     try:
         return tuple(
             find_support_surfaces(
-                points, normals, up, config.surface, rng, known=known, T_world_camera=T_world_camera
+                points, normals, up, config.surface, rng,
+                known=known, objects=objects, T_world_camera=T_world_camera,
             )
-        )
+        )  # fmt: skip
     except NoSurfaceError as error:
         raise NoSurfaceError(f"{cloud.name}: {error}") from None

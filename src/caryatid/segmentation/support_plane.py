@@ -363,6 +363,7 @@ def find_support_surfaces(
     rng: np.random.Generator,
     *,
     known: Sequence[SupportSurface] = (),
+    objects: Array | None = None,
     T_world_camera: Array | None = None,
 ) -> list[SupportSurface]:
     """Find the surfaces that may carry objects among the planes of a scene, the main one first.
@@ -379,6 +380,7 @@ def find_support_surfaces(
         config: Tolerances and sizes.
         rng: Draws the hypotheses.
         known: The surfaces known so far, which stay the first ones, in this order.
+        objects: Points (M, 3) [m] of objects, which are on no surface but stand on some.
         T_world_camera: Reported camera pose (4, 4) in the frame of the points, or None for a cloud.
 
     Raises:
@@ -413,12 +415,12 @@ def find_support_surfaces(
     if not known and not planes:
         raise NoSurfaceError(f"no support surface: {_tried(scene, rng, T_world_camera)}")
     if not known:
-        weights = None
+        weights, every = None, points if objects is None else np.concatenate([points, objects])
         if T_world_camera is not None:
-            rays = transforms.unit(points - T_world_camera[:3, 3])
+            rays = transforms.unit(every - T_world_camera[:3, 3])
             away = np.degrees(np.arccos(np.clip(rays @ T_world_camera[:3, 2], -1.0, 1.0)))
             weights = np.exp(-0.5 * (away / MIDDLE) ** 2)
-        main = _choose_table(planes, points, weights, config)
+        main = _choose_table(planes, points, every, weights, config)
         surfaces.append(_surface(points, planes.pop(main), config))
     for plane in (part for whole in planes for part in scene.parts(whole, 0.0)):
         if len(surfaces) == SUPPORT_LABEL - MAX_LABEL:
@@ -482,17 +484,23 @@ def refitted(
     return None if plane is None else _surface(points, plane, config)
 
 
-def _choose_table(planes: list[_Plane], points: Array, weights: Array | None, config: SurfaceConfig) -> int:
-    """The number of the plane that most points (N, 3), by their weights (N,), are on or over.
+def _choose_table(
+    planes: list[_Plane], points: Array, every: Array, weights: Array | None, config: SurfaceConfig
+) -> int:
+    """The number of the plane of some points that most of all (N, 3), by their weights (N,), are on or over.
 
     A point belongs to the highest plane below it. Without weights, only what stands on a plane counts, unless
     it is below another, as legs are: a floor is larger than a table. Planes as large as furniture come first.
     """
-    heights, below = np.full((len(planes), len(points)), np.inf), np.zeros(len(points), dtype=np.bool_)
+    heights, below = np.full((len(planes), len(every)), np.inf), np.zeros(len(every), dtype=np.bool_)
     for k, plane in enumerate(planes):
-        flat = points @ _basis(plane.normal).T
-        own = Region.around(np.compress(plane.inliers, flat, axis=0), CELL).grown(2.0 * CELL).holds(flat)
-        height = points @ plane.normal - plane.offset
+        basis = _basis(plane.normal)
+        flat = every @ basis.T
+        corners = hull(np.ascontiguousarray(np.compress(plane.inliers, points, axis=0) @ basis.T))
+        own = (
+            shapely.contains_xy(shapely.Polygon(corners).buffer(BESIDE), flat) if len(corners) > 2 else below
+        )
+        height = every @ plane.normal - plane.offset
         heights[k] = np.where(own & (height > -config.tolerance), height, np.inf)
         below |= own & (height < -config.search)
     least = heights.min(axis=0)
