@@ -413,8 +413,11 @@ class Scene(Pictured):
         missing, new = self._changes_seen(observation)
         if self.surface and before and self._registration and observation.view:
             # If everything it shows had changed, the pose would be wrong instead.
-            explained = list(new) if set(observation.shown_objects) - new.keys() else []
-            unexplained = observation.cloud.select(~np.isin(observation.labels, explained))
+            objects = set(observation.shown_objects)
+            # The room behind the surfaces belongs to nobody.
+            unexplained = observation.cloud.select(
+                np.isin(observation.labels, sorted(objects - new.keys() or objects))
+            )
             check_free(unexplained, self.surface, before, self.config)
         if not named:
             observation, new = self._associate_segments(observation, given, new)

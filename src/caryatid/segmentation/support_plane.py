@@ -28,7 +28,7 @@ CELL = 0.03
 SHOWN = 0.5
 """Minimum share of another surface than the main one that is seen [1]: noise beside a plane is scattered."""
 BESIDE = 0.05
-"""How far outside its outline the middle of an object may be that stands on a surface [m]."""
+"""How far outside its outline, or below it, the middle of what stands on a surface may be [m]."""
 MOST_PLANES = 6
 """Maximum number of planes, largest first, among which surfaces are found [1]."""
 MIDDLE = 5.0
@@ -344,13 +344,14 @@ class _Scene(NamedTuple):
 def find_surface_below(surfaces: Sequence[SupportSurface], points_world: Array) -> NDArray[np.intp]:
     """Number (N,) of the highest surface below each point (N, 3) [m]; 0, the main one, if there is none.
 
-    What stands on a surface hides it from view, so that all within its outline counts, and a little more.
+    What stands on a surface hides it from view, so that all within its outline counts, and a little more; so
+    does what is flat and, by an error of its fit, just below it.
     """
     least, below = np.full(len(points_world), np.inf), np.zeros(len(points_world), dtype=np.intp)
     for k, surface in enumerate(surfaces):
         height = surface.height(points_world)
         outline = shapely.Polygon(surface.outline_world[:, :2]).buffer(BESIDE)
-        nearer = (height > 0.0) & (height < least) & shapely.contains_xy(outline, points_world[:, :2])
+        nearer = (height > -BESIDE) & (height < least) & shapely.contains_xy(outline, points_world[:, :2])
         least[nearer], below[nearer] = height[nearer], k
     return below
 
