@@ -536,7 +536,10 @@ class Scene(Pictured):
     def _fused_surfaces(self, observation: Observation) -> tuple[SupportSurface, ...]:
         """The support surfaces from the points of all views."""
         fused, config = list(observation.surfaces), self.config.surface
+        shown = {o.label for o in self.graph.support_surfaces}
         for k, known in enumerate(self.surfaces):
+            if SUPPORT_LABEL - k not in shown:
+                continue
             own = self._models.points.of(SUPPORT_LABEL - k)
             if len(own) >= config.min_points:
                 fused[k] = refitted(known, own.points_world, own.normals_world, UP, config) or known

@@ -24,6 +24,8 @@ THIN = 0.03
 """Maximum thickness of a wall, as far as it is seen [m]: a board, and the noise of its readings."""
 MIN_WALL = 0.24
 """Minimum length of a wall along the border of the surface that it stands on [m]: an object is no wider."""
+ENOUGH = 4000
+"""Number of points that show where the parts of a view are [1]: a hundred of each."""
 TOUCHING = 3
 """Minimum number of samples in which a body meets the surface that it stands on [1]."""
 
@@ -129,11 +131,15 @@ def find_furniture(
         Which parts (P,).
     """
     count = len(stands_on)
-    sizes = np.maximum(np.bincount(part, minlength=count), 1)
-    places, highest = shapely.points(points_world[:, :2]), np.full(count, -np.inf)
-    np.maximum.at(highest, part, points_world[:, 2])
+    high, low = np.full((3, count), -np.inf), np.full((3, count), np.inf)
+    for k, along in enumerate(points_world.T):
+        np.maximum.at(high[k], part, along)
+        np.minimum.at(low[k], part, along)
+    highest, longest = high[2], (high - low)[:2].max(axis=0)
+    some = slice(None, None, max(1, len(part) // ENOUGH))
+    part, points_world = part[some], points_world[some]
+    sizes, places = np.maximum(np.bincount(part, minlength=count), 1), shapely.points(points_world[:, :2])
     lowest = np.array([surface.point_world[2] for surface in surfaces])[stands_on]
-    longest = np.array([np.ptp(points_world[part == k, :2], axis=0).max(initial=0.0) for k in range(count)])
     furniture = np.zeros(count, dtype=np.bool_)
     for surface in surfaces:
         outline = shapely.Polygon(surface.outline_world[:, :2])

@@ -30,7 +30,8 @@ SHOWN = 0.5
 BESIDE = 0.05
 """How far outside its outline, or below it, the middle of what stands on a surface may be [m]."""
 MOST_PLANES = 6
-"""Maximum number of planes, largest first, among which surfaces are found [1]."""
+"""Maximum number of planes, largest first, among which the surfaces of a first view are found [1]; in each
+later one, two more."""
 MIDDLE = 5.0
 """Angle from the optical axis at which what an image shows counts 0.6 of what its middle does [deg]: a fifth
 of the way to its border."""
@@ -160,7 +161,9 @@ class SupportSurface:
         Their height is between low and high [m].
         """
         height = self.height(points_world)
-        return (low < height) & (height < high) & self.region.grown(margin).holds(points_world)
+        over = (low < height) & (height < high)
+        over[over] = self.region.grown(margin).holds(points_world[over])
+        return over
 
     def pixels_over(
         self, view: View, low: float, high: float, margin: float = np.inf, *, core: bool = False
@@ -316,6 +319,8 @@ class _Scene(NamedTuple):
         parts, left = list[_Plane](), plane.inliers
         while np.count_nonzero(left) >= self.config.min_points:
             inliers, area = self._main_part(plane.normal, left, gap)
+            if np.count_nonzero(inliers) < self.config.min_points:
+                break
             parts.append(_Plane(plane.normal, plane.offset, inliers, area))
             left = left & ~inliers
         return parts
@@ -404,13 +409,13 @@ def find_support_surfaces(
     for surface in known:
         height, wide = surface.height(points), surface.region.grown(config.gap)
         near = left & (np.abs(height) < config.search) & wide.holds(points)
-        plane = scene.largest_plane(_some(near, 5_000), rng)
+        plane = scene.largest_plane(_some(near, 1_000 if surfaces else 5_000), rng)
         found = surface if plane is None else _surface(points, plane, config, surface.outline_world)
         surfaces.append(found.joined(surface))
         left &= ~near
     planes: list[_Plane] = []
-    left = _some(left, 5_000 if known else len(points))
-    while len(planes) < MOST_PLANES and (plane := scene.largest_plane(left, rng)):
+    left, most = (_some(left, 1_000), 2) if known else (left, MOST_PLANES)
+    while len(planes) < most and (plane := scene.largest_plane(left, rng)):
         planes.append(plane)
         left = left & (np.abs(points @ plane.normal - plane.offset) > 2.0 * config.tolerance)
     if not known and not planes:
@@ -426,6 +431,8 @@ def find_support_surfaces(
     for plane in (part for whole in planes for part in scene.parts(whole, 0.0)):
         if len(surfaces) == SUPPORT_LABEL - MAX_LABEL:
             break
+        if plane.area < SHOWN * config.min_width**2:
+            continue
         with suppress(NoSurfaceError):  # The points may lie on a line.
             surface = _surface(points, plane, config)
             alone = not any(surface.continues(other, config) for other in surfaces)
