@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from caryatid.config import SegmentationConfig
 from caryatid.geometry import transforms
@@ -86,8 +87,8 @@ def find_foreground(
     # What hides the upper end of a body may be what it carries.
     highest = np.lexsort((height, index))[np.cumsum(sizes) - 1]
     row, column = np.divmod(rows[highest], body.shape[1])
-    above = inverse_depth[np.maximum(row - 1 - np.arange(3)[:, None], 0), column]
-    hidden = np.any(above > inverse_depth[row, column] + jump, axis=0)
+    nearest = ndimage.maximum_filter(inverse_depth, 7)
+    hidden = np.asarray(nearest[row, column] > inverse_depth[row, column] + jump)
     unfit |= find_furniture(points, index, stands_on, surfaces, config, hidden)
     lost = np.isin(body, names[unfit]).repeat(step, 0).repeat(step, 1)
     owner[lost[: owner.shape[0], : owner.shape[1]]] = 0

@@ -147,6 +147,14 @@ def observe(
         given = _without_table(cloud, given, known, UP, config, rng, pose)
     surfaces = _find_surfaces(cloud, given, known, UP, config, rng, pose)
     if isinstance(source, View):
+        # A level face no larger than an object and closed below is the top of an object.
+        surfaces = tuple(
+            surface
+            for k, surface in enumerate(surfaces)
+            if k < max(len(known), 1)
+            or surface.shape.extents.max() > config.fit.max_extent
+            or surface.is_open_below(source, [s for s in surfaces if s is not surface], config.surface)
+        )
         surfaces = tuple(s.continued(source, config.surface) for s in surfaces)
     apart = np.empty((0, 2), dtype=np.int32)
     if given is not None:

@@ -25,6 +25,10 @@ Mask = NDArray[np.bool_]
 
 CELL = 0.03
 """Edge of the cells in which parts of a plane are told apart [m]; wider than the spacing of points at 3 m."""
+ROOM = 0.1
+"""Minimum room under a table no larger than an object [m]: what is lower is a lid, or a tray on something."""
+OPEN = 0.3
+"""Share of its border under which a table is open at least [1]; legs or uprights close the rest."""
 SHOWN = 0.5
 """Minimum share of another surface than the main one that is seen [1]: noise beside a plane is scattered."""
 BESIDE = 0.05
@@ -110,6 +114,14 @@ class Region:
             squares = ndimage.distance_transform_edt(~squares) <= margin / self.size
         return Region(self.corner - border, squares, self.size)
 
+    def filled(self) -> Region:
+        """The squares within the convex hull of the region: what stands on a surface hides it."""
+        corners = hull(np.argwhere(self.squares).astype(np.float64))
+        if len(corners) < 3:
+            return self
+        inside = shapely.contains_xy(shapely.Polygon(corners), *np.indices(self.squares.shape))
+        return replace(self, squares=self.squares | inside)
+
     def joined(self, other: Region) -> Region:
         """The squares of either region."""
         low = np.minimum(self.corner, other.corner)
@@ -130,8 +142,8 @@ class SupportSurface:
         point_world: Centroid of the inliers, moved onto the plane (3,) [m].
         outline_world: Convex hull (M, 3) of the inliers on the plane [m], counter-clockwise seen from above.
         shape: Thin box whose top face is the smallest rectangle around the outline; its z is the normal.
-        core: Where it was seen, and what lies between.
-        region: The core, and where something in front of it hides whether it goes on.
+        core: Where it was seen; in a view, also what lies between.
+        region: What lies within the hull of the core, and where something in front hides whether it goes on.
     """
 
     normal_world: Array
@@ -213,9 +225,7 @@ class SupportSurface:
         seen = np.pad(self.core.squares, int(np.ceil(config.gap / wide.size)))
         part, _ = ndimage.label(seen | (hidden & wide.squares))
         main = np.argmax(np.bincount(part[seen]))
-        seen &= part == main
-        corners = hull(np.argwhere(seen).astype(np.float64))
-        whole = shapely.contains_xy(shapely.Polygon(corners), *np.indices(seen.shape)) & ~through
+        whole = replace(wide, squares=seen & (part == main)).filled().squares & ~through
         region = replace(wide, squares=(part == main) | whole)
         return replace(self, core=replace(wide, squares=whole), region=region)
 
@@ -224,10 +234,31 @@ class SupportSurface:
         near = other.region.grown(config.gap).holds(self.region.places())
         return bool(near.any() and abs(other.height(self.point_world)) < config.search)
 
+    def is_open_below(self, view: View, others: Sequence[SupportSurface], config: SurfaceConfig) -> bool:
+        """Whether a view looks in under its border, above the next surface below; a box is closed there."""
+        rooms = [h for s in others if (h := float(s.height(self.point_world))) > config.search]
+        if rooms and min(rooms) < ROOM:
+            return False
+        corners, middle = self.outline_world, self.outline_world.mean(axis=0)
+        step = np.linspace(0.0, 1.0, 20, endpoint=False)[:, None, None]
+        border = (corners + step * (np.roll(corners, -1, axis=0) - corners)).reshape(-1, 3)
+        places = border + config.tolerance * transforms.unit(middle - border)
+        places -= min(rooms, default=0.0) / 2.0 * self.normal_world
+        points = transforms.transform(transforms.invert(view.pose), places)
+        points = points[points[:, 2] > config.tolerance]
+        column, row = np.rint((points @ view.K.T)[:, :2] / points[:, 2:]).astype(np.intp).T
+        height, width = view.depth.shape
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        z = view.depth[row[inside], column[inside]]
+        behind = z - points[inside, 2]
+        # What is nearer hides the border.
+        known = (z > 0.0) & (behind > -config.search)
+        return bool(np.mean(behind[known] > config.search) > OPEN) if rooms and known.any() else True
+
     def joined(self, known: SupportSurface) -> SupportSurface:
         """Return the surface with the places where it was known."""
         core = self.core.joined(known.core)
-        return replace(self, core=core, region=core)
+        return replace(self, core=core, region=core.filled())
 
     def moved(self, T: Array) -> SupportSurface:
         """Return the surface moved by a rigid transform (4, 4) of the world, by less than a square."""
@@ -504,10 +535,8 @@ def _choose_table(
     for k, plane in enumerate(planes):
         basis = _basis(plane.normal)
         flat = every @ basis.T
-        corners = hull(np.ascontiguousarray(np.compress(plane.inliers, points, axis=0) @ basis.T))
-        own = (
-            shapely.contains_xy(shapely.Polygon(corners).buffer(BESIDE), flat) if len(corners) > 2 else below
-        )
+        seen = np.compress(plane.inliers, points, axis=0) @ basis.T
+        own = Region.around(seen, CELL).grown(config.gap / 2.0 if weights is None else 2.0 * CELL).holds(flat)
         height = every @ plane.normal - plane.offset
         heights[k] = np.where(own & (height > -config.tolerance), height, np.inf)
         below |= own & (height < -config.search)
@@ -546,8 +575,8 @@ def _surface(
     box = Box(transforms.rigid(R, centre), np.array([*sizes[:, best], thickness]))
     # If a cloud is not in metres, there are no more squares than memory holds.
     size = max(config.spacing, float(np.ptp(on_plane[:, :2], axis=0).max()) / 1000.0)
-    region = Region.around(on_plane, size)
-    return SupportSurface(plane.normal, centroid, centroid + corners @ basis, box, region, region)
+    core = Region.around(on_plane, size)
+    return SupportSurface(plane.normal, centroid, centroid + corners @ basis, box, core, core.filled())
 
 
 def _basis(normal: Array) -> Array:
