@@ -18,7 +18,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Cylinder
 from caryatid.segmentation.observation import level_transform, observe
 from caryatid.sensing.clouds import oriented_points
-from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View
+from caryatid.sensing.views import MAX_LABEL, Cloud, View
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.generation import bowl
 from caryatid.simulation.world import Body, build_spec, scene_from_spec
