@@ -17,13 +17,14 @@ from synthetic import (
     simulated_views,
 )
 
-from caryatid.config import Config, FusionConfig, SensorConfig
+from caryatid.config import CloudConfig, Config, FusionConfig, SensorConfig
 from caryatid.errors import InputError, PerceptionError
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.scene import Scene
+from caryatid.sensing.clouds import reduced
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.truth import ground_truth
@@ -271,17 +272,17 @@ def test_labels_come_with_all_views_or_with_none():
 
 def test_of_large_images_as_many_pixels_are_used_as_points_are_kept(caplog):
     """The others have the labels of those beside them."""
-    camera = SimulatedCamera(simulated_scene("tower"), sensor=SensorConfig(1281, 959, 1210.0))
+    camera = SimulatedCamera(simulated_scene("tower"), sensor=SensorConfig(1921, 1439, 1815.0))
     view = replace(camera.capture(look_from(180.0)), normals_camera=None)
     scene = Scene(segmentation="labels")
     with caplog.at_level("INFO"):
         graph = scene.update(view)
-    assert "using 641×480 of 1281×959 pixels" in caplog.text
+    assert "using 961×720 of 1921×1439 pixels" in caplog.text
     assert scene.labels.shape == view.depth.shape
     objects = (scene.labels > 0) & (scene.labels != SUPPORT_LABEL)
     assert (scene.labels == view.labels)[objects].mean() > 0.98
     assert objects.sum() == pytest.approx((view.labels > 0).sum(), rel=0.03)
-    few = model_of([view.every(2)]).graph
+    few = model_of([reduced(view, 2, CloudConfig())]).graph
     assert graph_text(graph) == graph_text(few)
 
 

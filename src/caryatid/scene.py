@@ -26,7 +26,7 @@ from caryatid.graph import (
     label_of,
     object_id,
 )
-from caryatid.objects.changes import ChangeDetector, appeared
+from caryatid.objects.changes import ChangeDetector, appeared, check_free
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed, without
 from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
@@ -38,7 +38,6 @@ from caryatid.segmentation.support_plane import SupportSurface, find_surface_bel
 from caryatid.segmentation.view_checks import (
     check_camera,
     check_centre,
-    check_free,
     check_masks,
     check_place,
     check_range,
@@ -486,7 +485,7 @@ class Scene(Pictured):
         (height, width), (rows, columns) = source.depth.shape, used.depth.shape
         if not self.views and rows < height:
             log.info(
-                "%s: using %d×%d of %d×%d pixels, at the spacing of cloud.voxel",
+                "%s: using %d×%d of %d×%d pixels, for samples cloud.voxel apart",
                 source.name, columns, rows, width, height,
             )  # fmt: skip
 

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import copy
+import logging
 from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc
 
+from caryatid.config import Config
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Change, ChangeKind, SceneObject
 from caryatid.objects.fusion import extents_ratio
-from caryatid.sensing.views import View
-from caryatid.sensing.voxel_map import FREE, OCCUPIED
+from caryatid.segmentation.support_plane import SupportSurface
+from caryatid.sensing.views import Cloud, View
+from caryatid.sensing.voxel_map import FREE, OCCUPIED, VoxelMap
+
+log = logging.getLogger(__name__)
 
 DEPTH_MARGIN = 0.02
 """Distance behind a point at which a reading contradicts it [m], at 1.5 m and growing with z²: 2σ of pose
@@ -32,6 +37,9 @@ TINY = 1e-300
 """Minimum probability [1], so that logarithms stay finite."""
 PRIOR_ODDS = 7.0
 """Log-odds against a change, before anything is seen: one in a thousand objects changes between two views."""
+BEHIND = 2
+"""Depth to which earlier views must have looked through the surface of a point [voxels]. A voxel of the
+surface itself is half free, and a pose that could not be registered is wrong by a voxel."""
 SIZE_TOLERANCE = 0.2
 """Share by which sizes of one object may differ [1], beyond what the fits' uncertainty explains."""
 
@@ -148,6 +156,30 @@ def appeared(
         if likelihood_ratio(there, other) > PRIOR_ODDS:
             new[label] = f"{name} shows {there} of its points where space was free, {other} where not"
     return new
+
+
+def check_free(cloud: Cloud, surface: SupportSurface, voxels: VoxelMap, config: Config) -> None:
+    """Warn if earlier views looked through what a view shows above the table, and into what is behind.
+
+    Args:
+        cloud: Points of the view that no change explains.
+        surface: The support surface.
+        voxels: The map of earlier views.
+        config: All settings.
+    """
+    points, inward = cloud.points_world, -voxels.config.size * cloud.normals_world
+    over = surface.height(points) > 2.0 * config.surface.tolerance
+    over &= ((points > voxels.origin_world) & (points < voxels.end_world)).all(axis=1)
+    points, inward = points[over], inward[over]
+    free = [voxels.state_at(points + step * inward) == FREE for step in range(BEHIND + 1)]
+    through = np.all(free, axis=0)
+    there, other = distinct(points[through]), distinct(points[~through])
+    if likelihood_ratio(there, other) > PRIOR_ODDS:
+        log.warning(
+            "%s: %.0f%% of its points above the table are in space that earlier views saw as free; its pose "
+            "is wrong, or objects were moved",
+            cloud.name, 100.0 * through.mean(),
+        )  # fmt: skip
 
 
 class Sight:

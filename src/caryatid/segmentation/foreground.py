@@ -9,11 +9,10 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from caryatid.config import SegmentationConfig
+from caryatid.config import Config
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import kernel
-from caryatid.segmentation.seams import GAP, cut_at_seams, find_seams
 from caryatid.segmentation.support_plane import Mask, SupportSurface
 from caryatid.sensing.views import View
 
@@ -23,32 +22,28 @@ PARTLY = 0.4
 """Share of a leg or wall along the border of what it carries [1]: from inside, half of it is seen."""
 THIN = 0.03
 """Maximum thickness of a wall, as far as it is seen [m]: a board, and the noise of its readings."""
-MIN_WALL = 0.24
-"""Minimum length of a wall along the border of the surface that it stands on [m]: an object is no wider."""
 ENOUGH = 4000
 """Number of points that show where the parts of a view are [1]: a hundred of each."""
 TOUCHING = 3
 """Minimum number of samples in which a body meets the surface that it stands on [1]."""
 
 
-def find_foreground(
-    view: View, surfaces: Sequence[SupportSurface], config: SegmentationConfig, reach: float
-) -> list[Mask]:
+def find_foreground(view: View, surfaces: Sequence[SupportSurface], config: Config) -> list[Mask]:
     """Find the pixels of what may stand, directly or not, on each of some surfaces.
 
     A pixel belongs to the highest surface below it. On other surfaces than the main one, objects touch the
-    surface, are within reach and wholly in the image, and no higher than objects are.
+    surface, are wholly in the image, no higher than objects are, and near the middle of the main surface.
 
     Args:
         view: The view, which has a pose.
         surfaces: The support surfaces, the main one first.
         config: Sampling, margins and sizes.
-        reach: Maximum distance from the middle of the main surface, in plan [m].
 
     Returns:
         For each surface, which pixels (H, W).
     """
-    low, high, margin = config.clearance, config.max_height, config.margin
+    settings = config.segmentation
+    low, high, margin = settings.clearance, settings.max_height, settings.margin
     if len(surfaces) == 1:
         return [surfaces[0].pixels_over(view, low, high, margin)]
     owner, level = np.zeros((2, *view.depth.shape), dtype=np.int32)
@@ -57,8 +52,9 @@ def find_foreground(
         over = surfaces[k].pixels_over(view, -low, np.inf if k else high, margin) & (owner + level == 0)
         on = over & ~surfaces[k].pixels_over(view, low, np.inf, margin)
         level[on], owner[over & ~on] = k + 1, k + 1
-    step, grid = config.stride, np.s_[:: config.stride, :: config.stride]
-    depth, jump = view.depth[grid].astype(np.float64), 2.0 * config.edge_jump
+    step = settings.stride
+    grid = np.s_[::step, ::step]
+    depth, jump = view.depth[grid].astype(np.float64), 2.0 * settings.edge_jump
     inverse_depth = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0.0)
     body = np.where(owner[grid] > 0, find_bodies(owner[grid], inverse_depth, jump), -1)
     rows = np.flatnonzero(body >= 0)
@@ -73,7 +69,10 @@ def find_foreground(
         return np.asarray(np.bincount(index, which, len(names)) / sizes)
 
     meeting = find_meeting(body, owner[grid], level[grid], inverse_depth, jump)[names]
-    near = np.linalg.norm(points[:, :2] - surfaces[0].point_world[:2], axis=1) < reach
+    near = (
+        np.linalg.norm(points[:, :2] - surfaces[0].point_world[:2], axis=1)
+        < min(config.voxels.extent[:2]) / 2.0
+    )
     inner = np.zeros(body.shape, dtype=np.bool_)
     inner[1:-1, 1:-1] = True
     cut = share(~inner.ravel()[rows]) > 0.0
@@ -93,15 +92,10 @@ def find_foreground(
     lost = np.isin(body, names[unfit]).repeat(step, 0).repeat(step, 1)
     owner[lost[: owner.shape[0], : owner.shape[1]]] = 0
     carrying = {0, *stands_on[~unfit].tolist()}
-    if view.rgb is not None:
-        faces = {k: level[grid] == k + 1 for k in carrying if k > 0}
-        carrying -= {
-            k for k, face in faces.items() if face.any() and _is_layer(view, face, surfaces[k], config)
-        }
     if len(carrying) < len(surfaces):
-        # What carries nothing may itself be the top of an object; what seams cut are the tops of several.
+        # What carries nothing may itself be the top of an object.
         numbers = sorted(carrying)
-        some = find_foreground(view, [surfaces[k] for k in numbers], config, reach)
+        some = find_foreground(view, [surfaces[k] for k in numbers], config)
         found = dict(zip(numbers, some, strict=True))
         return [found.get(k, np.zeros_like(view.valid)) for k in range(len(surfaces))]
     return [(owner == k + 1) & surface.pixels_over(view, low, high) for k, surface in enumerate(surfaces)]
@@ -112,7 +106,7 @@ def find_furniture(
     part: NDArray[np.integer],
     stands_on: NDArray[np.integer],
     surfaces: Sequence[SupportSurface],
-    config: SegmentationConfig,
+    config: Config,
     hidden: Mask,
 ) -> Mask:
     """Find the parts of a view that are legs, walls or uprights of surfaces, and no objects.
@@ -125,13 +119,13 @@ def find_furniture(
         part: Part (N,) of each, 0 … P − 1.
         stands_on: Number (P,) of the surface that each part is over.
         surfaces: The support surfaces.
-        config: Width of the borders.
+        config: Width of the borders, and the least length of a wall.
         hidden: Whether the upper end of each part is hidden (P,).
 
     Returns:
         Which parts (P,).
     """
-    count = len(stands_on)
+    count, margin = len(stands_on), config.segmentation.margin
     high, low = np.full((3, count), -np.inf), np.full((3, count), np.inf)
     for k, along in enumerate(points_world.T):
         np.maximum.at(high[k], part, along)
@@ -145,30 +139,17 @@ def find_furniture(
     for surface in surfaces:
         outline = shapely.Polygon(surface.outline_world[:, :2])
         away = shapely.distance(places, outline.exterior)
-        within = surface.region.grown(config.margin).holds(points_world)
+        within = surface.region.grown(margin).holds(points_world)
         # Something on the surface may hide a corner of it.
-        border = within & ((away <= config.margin) | ~shapely.contains(outline, places))
+        border = within & ((away <= margin) | ~shapely.contains(outline, places))
         close, along, under = (
             np.bincount(part, which, count) / sizes for which in (away <= THIN, border, within)
         )
         room = surface.point_world[2] - lowest
-        leg = (under > MOST) & (along > PARTLY) & (hidden | (highest > lowest + room - config.margin))
-        wall = (close > MOST) & (longest > MIN_WALL)
+        leg = (under > MOST) & (along > PARTLY) & (hidden | (highest > lowest + room - margin))
+        wall = (close > MOST) & (longest > config.surface.min_width)
         furniture |= ((room > 0.0) & leg) | ((room == 0.0) & wall)
     return furniture
-
-
-def _is_layer(view: View, level: Mask, surface: SupportSurface, config: SegmentationConfig) -> bool:
-    """Whether seams cut what a view shows of a level face (H, W), on the grid, into tops of objects."""
-    assert view.rgb is not None
-    grid = slice(0, view.depth.shape[0], config.stride), slice(0, view.depth.shape[1], config.stride)
-    up = np.broadcast_to(surface.normal_world @ view.pose[:3, :3], (*level.shape, 3))
-    spacing = config.stride * float(np.median(view.depth[grid][level])) / view.K[0, 0]
-    least = config.min_area / spacing**2
-    seam = find_seams(view.rgb, grid)[: level.shape[0], : level.shape[1]]
-    pieces = cut_at_seams(level.astype(np.int32), up, seam, GAP // config.stride, least)
-    sizes = np.sort(np.bincount(pieces[level]))[::-1]
-    return bool(sizes[0] < 0.5 * sizes.sum())
 
 
 @kernel

@@ -20,7 +20,7 @@ from caryatid.segmentation.samples import Labels
 from caryatid.segmentation.seams import Pairs
 from caryatid.segmentation.segments import segment, segment_cloud
 from caryatid.segmentation.support_plane import SupportSurface, find_support_surfaces, find_surface_below
-from caryatid.sensing.clouds import oriented_points, thin
+from caryatid.sensing.clouds import oriented_points, reduced, thin, working_distance
 from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View
 
 WHOLE = 0.1
@@ -133,7 +133,7 @@ def observe(
     if segmentation == "labels" and source.labels is None:
         raise InputError(source.name, "has no labels", "give masks, or segment with --segmentation auto")
     use_labels = source.labels is not None and segmentation != "auto"
-    source = thinned(source, config.cloud)
+    source = thinned(source, config)
     if isinstance(source, View) and source.T_world_camera is None:
         if known:
             raise InputError(source.name, "has no camera pose", "give one; only the first view may lack it")
@@ -183,8 +183,7 @@ def segment_view(
         config: All settings.
         rng: Draws the samples of fits.
     """
-    reach = min(config.voxels.extent[:2]) / 2.0
-    foregrounds = find_foreground(view, surfaces, config.segmentation, reach)
+    foregrounds = find_foreground(view, surfaces, config)
     image, pairs = np.zeros(view.depth.shape, dtype=np.int32), [np.empty((0, 2), dtype=np.int32)]
     for k, (surface, own) in enumerate(zip(surfaces, foregrounds, strict=True)):
         others = [f for n, f in enumerate(foregrounds) if n != k]
@@ -198,7 +197,7 @@ def segment_view(
         points = transforms.transform(view.pose, view.depth.ravel()[rows, None] * rays)
         names = np.arange(part.max(initial=0))
         furniture = find_furniture(
-            points, part.ravel()[rows] - 1, np.full(len(names), k), surfaces, config.segmentation, names < 0
+            points, part.ravel()[rows] - 1, np.full(len(names), k), surfaces, config, names < 0
         )
         part = np.where(np.append(False, furniture)[part], 0, part)
         number = image.max()
@@ -240,10 +239,15 @@ def label_image(observation: Observation, source: View | Cloud) -> NDArray[np.in
     return image
 
 
-def thinned(source: View | Cloud, config: CloudConfig) -> View | Cloud:
-    """Return every n-th pixel of a view whose pixels are denser than needed."""
-    step = 1 if isinstance(source, Cloud) else int(config.voxel * source.K[0, 0] / config.max_depth)
-    return source.every(step) if isinstance(source, View) and step > 1 else source
+def thinned(source: View | Cloud, config: Config) -> View | Cloud:
+    """Return a view with every n-th pixel, so that samples are `cloud.voxel` apart at its working distance.
+
+    Windows, segments and the network then see the sizes that they were made for, from near and from far.
+    """
+    if isinstance(source, Cloud) or (distance := working_distance(source, config.cloud)) == 0.0:
+        return source
+    spacing = config.segmentation.stride * distance / source.K[0, 0]
+    return reduced(source, max(1, int(config.cloud.voxel / spacing)), config.cloud)
 
 
 def _points(
@@ -292,7 +296,7 @@ def level_transform(
         NoSurfaceError: There is no support surface.
         PerceptionError: There are no readings.
     """
-    source = thinned(source, config.cloud)
+    source = thinned(source, config)
     cloud, pixels = _points(source, config)
     pose = np.eye(4)  # the source is in the frame of its camera
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None

@@ -81,11 +81,6 @@ class Region:
         # A point that registration moved leaves its square.
         return cls(low, ndimage.binary_closing(squares, np.ones((3, 3))), size)
 
-    @property
-    def area(self) -> float:
-        """Area [m²]."""
-        return float(np.count_nonzero(self.squares)) * self.size**2
-
     def holds(self, places: Array) -> Mask:
         """Whether places (N, 2) [m], or the x and y of points (N, 3), are in it."""
         index = np.floor(places[:, :2] / self.size).astype(np.intp) - self.corner

@@ -13,7 +13,7 @@ from caryatid.errors import WrongViewError
 from caryatid.geometry.transforms import Array
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
-from caryatid.sensing.voxel_map import FREE, VoxelMap
+from caryatid.sensing.voxel_map import VoxelMap
 
 log = logging.getLogger(__name__)
 
@@ -22,12 +22,6 @@ AWAY = 100.0
 and a camera farther than 10 cm from the origin is beyond it in millimetres."""
 COARSER = 4
 """Edge of the cells in which views are compared [voxels]; wider than the point spacing of small images."""
-THROUGH = 0.1
-"""Share of a view's points above the table that earlier views looked through, which triggers a warning [1];
-at most 3 % with correct poses."""
-BEHIND = 2
-"""Depth to which earlier views must have looked through the surface of such a point [voxels]. A voxel of the
-surface itself is half free, and a pose that could not be registered is wrong by a voxel."""
 
 
 def check_camera(view: View, max_coordinate: float) -> None:
@@ -138,30 +132,6 @@ def check_place(
     common = float(seen[tuple(voxel[within].T // COARSER)].mean())
     if not aligned and common < config.registration.common:
         raise refused(f"only {common:.0%} of its points lie on surfaces of earlier views")
-
-
-def check_free(cloud: Cloud, surface: SupportSurface, voxels: VoxelMap, config: Config) -> None:
-    """Warn if earlier views looked through many points of a view above the table, and into what is behind.
-
-    Args:
-        cloud: Points of the view that no change explains.
-        surface: The support surface.
-        voxels: The map of earlier views.
-        config: All settings.
-    """
-    some = slice(None, None, max(1, len(cloud) // 20_000))
-    points, inward = cloud.points_world[some], -voxels.config.size * cloud.normals_world[some]
-    over = (points - surface.point_world) @ surface.normal_world > 2.0 * config.surface.tolerance
-    over &= ((points > voxels.origin_world) & (points < voxels.end_world)).all(axis=1)
-    points, inward = points[over], inward[over]
-    free = [voxels.state_at(points + step * inward) == FREE for step in range(BEHIND + 1)]
-    through = np.all(free, axis=0)
-    if through.sum() > THROUGH * len(through):
-        log.warning(
-            "%s: %.0f%% of its points above the table are in space that earlier views saw as free; its pose "
-            "is wrong, or objects were moved",
-            cloud.name, 100.0 * through.mean(),
-        )  # fmt: skip
 
 
 def described(view: View) -> str:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -43,10 +46,9 @@ def oriented_points(
         points = transforms.transform(T, view.points_camera.reshape(-1, 3)[pixels])
         return points, transforms.rotate(T, given.reshape(-1, 3)[pixels].astype(float)), pixels
     inverse_depth = np.divide(np.float32(1.0), view.depth, out=np.zeros_like(view.depth), where=taken)
-    # The median depth of readings in range, in every fourth row and column, decides how wide a window is.
-    radius, readings = config.normal_window // 2, view.depth[::4, ::4][taken[::4, ::4]]
-    if len(readings) > 0:
-        width = config.normal_size * view.K[0, 0] / float(np.median(readings))
+    radius = config.normal_window // 2
+    if distance := working_distance(view, config):
+        width = config.normal_size * view.K[0, 0] / distance
         radius = min(radius, max(1, round((width - 1.0) / 2.0)))
     if among is not None:
         inverse_depth[~among] = 0.0
@@ -55,6 +57,64 @@ def oriented_points(
     points, normals = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
     for_each(_orient, SHARES, (pixels, planes, np.ascontiguousarray(view.K), T, points, normals))
     return points, normals, pixels
+
+
+def working_distance(view: View, config: CloudConfig) -> float:
+    """Median depth [m] of the readings in range, in every fourth row and column; 0 if there are none."""
+    readings = view.depth[::4, ::4]
+    readings = readings[(readings >= max(config.min_depth, 1e-9)) & (readings <= config.max_depth)]
+    return float(np.median(readings)) if len(readings) > 0 else 0.0
+
+
+def reduced(view: View, step: int, config: CloudConfig) -> View:
+    """Return a view with one pixel for each block of `step` × `step` pixels, whose readings are averaged.
+
+    Readings beyond a depth edge of the block's median do not count; without readings in half of the block,
+    the pixel has none. Colours are means, and the other images those of the median reading.
+    """
+    if step == 1:
+        return view
+    height, width = (-(-n // step) for n in view.depth.shape)
+    K = view.K / np.array([[step], [step], [1.0]])
+    K[:2, 2] -= (step - 1) / (2.0 * step)
+    inverse_depth = np.divide(np.float32(1.0), view.depth, out=np.zeros_like(view.depth), where=view.valid)
+    depth, pixels = np.zeros((height, width), np.float32), np.zeros((height, width), np.int64)
+    jump = np.float32(config.edge_jump + slope_limit(view.K[0, 0], config) * (step - 1))
+    for_each(_average, SHARES, (inverse_depth, step, jump, depth, pixels))
+    images = dict[str, Any]()
+    for name in ("labels", "normals_camera", "ignored"):
+        if (image := getattr(view, name)) is not None:
+            images[name] = image.reshape(-1, *image.shape[2:])[pixels]
+    if view.rgb is not None:
+        beyond = [(0, -n % step) for n in view.depth.shape]
+        blocks = np.pad(view.rgb, (*beyond, (0, 0)), mode="edge").reshape(height, step, width, step, 3)
+        images["rgb"] = blocks.mean(axis=(1, 3)).astype(np.uint8)
+    return replace(view, depth=depth, K=K, **images)
+
+
+@kernel
+def _average(share, data):  # type: ignore[no-untyped-def]
+    """Write the mean depth of every 16th row of blocks, and the pixel with the median reading of each."""
+    inverse_depth, step, jump, depth, pixels = data
+    height, width = inverse_depth.shape
+    values, places = np.empty(step * step, np.float32), np.empty(step * step, np.int64)
+    for row in range(share, depth.shape[0], SHARES):
+        for column in range(depth.shape[1]):
+            count = 0
+            for v in range(row * step, min((row + 1) * step, height)):
+                for u in range(column * step, min((column + 1) * step, width)):
+                    if inverse_depth[v, u] > ZERO:
+                        values[count], places[count] = inverse_depth[v, u], v * width + u
+                        count += 1
+            pixels[row, column] = row * step * width + column * step
+            if 2 * count < step * step:
+                continue
+            middle = np.argsort(values[:count])[count // 2]
+            total, near = ZERO, ZERO
+            for k in range(count):
+                if abs(values[k] - values[middle]) <= jump:
+                    total, near = total + values[k], near + np.float32(1.0)
+            depth[row, column], pixels[row, column] = near / total, places[middle]
 
 
 def slope_limit(focal: float, config: CloudConfig) -> float:
