@@ -18,7 +18,7 @@ from caryatid.geometry.transforms import UP, Array
 from caryatid.segmentation.foreground import find_bodies, find_foreground, find_furniture
 from caryatid.segmentation.samples import Labels
 from caryatid.segmentation.seams import Pairs
-from caryatid.segmentation.segments import segment, segment_cloud
+from caryatid.segmentation.segments import SMALLEST, segment, segment_cloud
 from caryatid.segmentation.support_plane import SupportSurface, find_support_surfaces, find_surface_below
 from caryatid.sensing.clouds import oriented_points, reduced, thin, working_distance
 from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View
@@ -134,6 +134,7 @@ def observe(
         raise InputError(source.name, "has no labels", "give masks, or segment with --segmentation auto")
     use_labels = source.labels is not None and segmentation != "auto"
     source = thinned(source, config)
+    config = _without_stride(source, config)
     if isinstance(source, View) and source.T_world_camera is None:
         if known:
             raise InputError(source.name, "has no camera pose", "give one; only the first view may lack it")
@@ -248,6 +249,13 @@ def thinned(source: View | Cloud, config: Config) -> View | Cloud:
         return source
     spacing = config.segmentation.stride * distance / source.K[0, 0]
     return reduced(source, max(1, int(config.cloud.voxel / spacing)), config.cloud)
+
+
+def _without_stride(source: View | Cloud, config: Config) -> Config:
+    """Return the settings with which all pixels of an image too small for the network are samples."""
+    if isinstance(source, Cloud) or source.depth.shape[1] >= SMALLEST * config.segmentation.stride:
+        return config
+    return replace(config, segmentation=replace(config.segmentation, stride=1))
 
 
 def _points(
