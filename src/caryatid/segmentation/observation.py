@@ -241,14 +241,14 @@ def label_image(observation: Observation, source: View | Cloud) -> NDArray[np.in
 
 
 def thinned(source: View | Cloud, config: Config) -> View | Cloud:
-    """Return a view with every n-th pixel, so that samples are `cloud.voxel` apart at its working distance.
+    """Return a view with averaged pixels, so that samples are `cloud.voxel` apart at its working distance.
 
     Windows, segments and the network then see the sizes that they were made for, from near and from far.
     """
     if isinstance(source, Cloud) or (distance := working_distance(source, config.cloud)) == 0.0:
         return source
     spacing = config.segmentation.stride * distance / source.K[0, 0]
-    return reduced(source, max(1, int(config.cloud.voxel / spacing)), config.cloud)
+    return reduced(source, max(1, min(int(config.cloud.voxel / spacing), *source.depth.shape)), config.cloud)
 
 
 def _without_stride(source: View | Cloud, config: Config) -> Config:
