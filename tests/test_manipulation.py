@@ -463,8 +463,8 @@ class TestCommands:
     @pytest.mark.parametrize(
         ("name", "segmentation", "why", "views"),
         [("clear", "labels", "is not an object of the scene; known objects: o1, o2", None),
-         ("clear", "auto", "was not found in 2 views; objects found: o1", 2),
-         ("explore", "auto", "was not found in 2 views; objects found: o1", 2)],
+         ("clear", "auto", "was not found in 2 views; objects found: o1, o2", 2),
+         ("explore", "auto", "was not found in 2 views; objects found: o1, o2", 2)],
     )  # fmt: skip
     def test_an_unknown_goal_is_an_error(self, name, segmentation, why, views, scene_file, tmp_path, capsys):
         command = [name, scene_file, "--goal", "o99", "--views", 2, "--segmentation", segmentation]
