@@ -92,7 +92,7 @@ class SurfaceConfig:
     """Maximum angle between its normal and the vertical, if the view has a pose [deg]."""
     max_deviation: Angle = 25.0
     """Maximum angle between the normals of a point and its plane [deg]; 3σ of normals from depth."""
-    gap: Positive = 0.3
+    gap: Annotated[float, Field(gt=0, le=2)] = 0.3
     """Regions of one plane farther apart than this are two surfaces [m]; occlusion shadows are narrower."""
     min_width: NotNegative = 0.24
     """Minimum width of furniture [m]; a large hand spans as much, and holds no object that is wider."""
@@ -114,7 +114,7 @@ class RegistrationConfig:
     """Expected error of a reported position, per axis [m]; about twice the usual error."""
     rotation: Positive = 0.5
     """Expected error of a reported orientation, per axis, about the camera [deg]."""
-    noise: Positive = 0.001
+    noise: Annotated[float, Field(ge=1e-6, le=1e18)] = 0.001
     """Expected point-to-plane distance of two matched patches, beyond the noise of their readings [m]."""
     spacing: Positive = 0.01
     """Size of the patches on objects, over which readings are averaged [m]; a dozen pixels at 1.5 m."""
@@ -143,7 +143,7 @@ class SegmentationConfig:
 
     stride: Count = 2
     """Pixels between samples of the organised image; 2 keeps 6 mm at 1.5 m. 1 in images below 320 px."""
-    margin: NotNegative = 0.05
+    margin: Annotated[float, Field(ge=0, le=2)] = 0.05
     """Points farther than this outside the support surface's outline belong to no object [m]."""
     edge_jump: Positive = 0.006
     """Distance of a sample from its neighbour's plane that separates surfaces [m]; at 1 m, grows with z²."""
