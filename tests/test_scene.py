@@ -24,7 +24,7 @@ from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.scene import Scene
-from caryatid.sensing.clouds import reduced
+from caryatid.sensing.clouds import average_pixels
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.truth import ground_truth
@@ -246,6 +246,16 @@ def test_errors_of_poses_are_undone_within_the_limits(error, undone, segmentatio
         assert np.array_equal(scene.T_world_camera, reported) != aligned
 
 
+def test_surfaces_take_no_more_memory_with_views_that_show_nothing_new():
+    view = simulated_views("tower")[0]
+    scene, sizes = Scene(segmentation="labels"), []
+    for _ in range(6):
+        scene.update(view)
+        sizes.append(sum(surface.core.squares.size for surface in scene.surfaces))
+    assert len(scene.surfaces) > 1
+    assert sizes[1] == sizes[5]
+
+
 def test_a_first_view_without_a_pose_gets_one_and_a_view_that_is_refused_changes_nothing():
     view = replace(simulated_views("tower")[0], T_world_camera=None)
     scene = Scene(segmentation="labels")
@@ -282,7 +292,7 @@ def test_of_large_images_as_many_pixels_are_used_as_points_are_kept(caplog):
     objects = (scene.labels > 0) & (scene.labels != SUPPORT_LABEL)
     assert (scene.labels == view.labels)[objects].mean() > 0.98
     assert objects.sum() == pytest.approx((view.labels > 0).sum(), rel=0.03)
-    few = model_of([reduced(view, 2, CloudConfig())]).graph
+    few = model_of([average_pixels(view, 2, CloudConfig())]).graph
     assert graph_text(graph) == graph_text(few)
 
 

@@ -10,7 +10,7 @@ from caryatid.config import CloudConfig, MaskConfig, VoxelConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Sphere
-from caryatid.sensing.clouds import estimate_normals, oriented_points
+from caryatid.sensing.clouds import average_pixels, estimate_normals, oriented_points
 from caryatid.sensing.masks import labels_from_masks
 from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, View
 from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
@@ -148,6 +148,22 @@ def test_bad_masks_are_errors_that_say_so(masks, scores, what):
 
 
 CLOUDS = CloudConfig()
+
+
+def test_averaged_pixels_stay_on_their_surface_and_do_not_mix_both_sides_of_an_edge():
+    u, v = np.meshgrid(np.arange(65), np.arange(50))
+    inverse = 1.0 + 0.002 * (u - 32) + 0.001 * (v - 25)
+    depth = np.where(u < 31, 1.0 / inverse, 2.0 / inverse)
+    view = View(depth, np.array([[100.0, 0.0, 32.0], [0.0, 100.0, 25.0], [0.0, 0.0, 1.0]]))
+    few = average_pixels(view, 3, CloudConfig())
+    assert few.depth.shape == (17, 22)
+    # Each side is a plane n·p = d, which no pixel leaves.
+    for whole, reduced in ((view.points_camera[:, :30], few.points_camera[:, :10]),
+                           (view.points_camera[:, 31:], few.points_camera[:, 11:-1])):  # fmt: skip
+        plane = np.linalg.lstsq(whole.reshape(-1, 3), np.ones(whole[..., 0].size))[0]
+        assert np.abs(reduced[:-1].reshape(-1, 3) @ plane - 1.0).max() < 1e-3
+    edge = few.depth[:-1, 10] * (1.0 + 0.002 * (31 - 32) + 0.001 * (3.0 * np.arange(16) + 1.0 - 25))
+    assert (np.minimum(np.abs(edge - 1.0), np.abs(edge - 2.0)) < 0.01).all()
 
 
 def test_normals_do_not_smooth_over_depth_edges_and_need_readings():

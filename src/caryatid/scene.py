@@ -396,7 +396,7 @@ class Scene(Pictured):
         self.identified = named = given and self._named(source)
         observation = self._observed(source)
         if observation.view is not None and isinstance(source, View):
-            self._say_thinned(source, observation.view)
+            self._say_resampled(source, observation.view)
             check_range(source, self.config)
             if given:
                 check_masks(source, observation.cloud.viewpoint_world, observation.surface, self.config)
@@ -480,7 +480,7 @@ class Scene(Pictured):
                 name, wrong, shown,
             )  # fmt: skip
 
-    def _say_thinned(self, source: View, used: View) -> None:
+    def _say_resampled(self, source: View, used: View) -> None:
         """Report once that only some pixels of large images are used."""
         (height, width), (rows, columns) = source.depth.shape, used.depth.shape
         if not self.views and rows < height:

@@ -86,6 +86,7 @@ class RunWriter(StagedFolder):
             folder, own=lambda place: OWN_FILES if is_run(place) else None, published=self.past is not None
         )
         record = {} if self.past is None else self.past.record
+        self._date: str = record.get("date") or datetime.now(UTC).isoformat(timespec="seconds")
         self.steps: list[dict[str, Any]] = [*record.get("steps", ())]
         self._scores: list[Mapping[str, Any]] = [*record.get("scores", ())]
         self.more: dict[str, Any] = {}
@@ -148,7 +149,7 @@ class RunWriter(StagedFolder):
     def _finish(self, more: dict[str, Any]) -> None:
         """Write the files of the whole run, run.json last, and publish the folder."""
         document = {"format": FORMAT, "version": 2, "views": len(self.steps)} | self._about
-        document["date"] = datetime.now(UTC).isoformat(timespec="seconds")
+        document["date"] = self._date
         document["versions"] = {"python": platform.python_version()} | {p: version(p) for p in PACKAGES}
         document |= {name: self.steps[-1][name] for name in ("angle_travelled", "path_travelled")}
         document["steps"] = self.steps

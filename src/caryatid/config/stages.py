@@ -92,7 +92,7 @@ class SurfaceConfig:
     """Maximum angle between its normal and the vertical, if the view has a pose [deg]."""
     max_deviation: Angle = 25.0
     """Maximum angle between the normals of a point and its plane [deg]; 3σ of normals from depth."""
-    gap: Annotated[float, Field(gt=0, le=2)] = 0.3
+    gap: Positive = 0.3
     """Regions of one plane farther apart than this are two surfaces [m]; occlusion shadows are narrower."""
     min_width: NotNegative = 0.24
     """Minimum width of furniture [m]; a large hand spans as much, and holds no object that is wider."""
@@ -143,7 +143,7 @@ class SegmentationConfig:
 
     stride: Count = 2
     """Pixels between samples of the organised image; 2 keeps 6 mm at 1.5 m. 1 in images below 320 px."""
-    margin: Annotated[float, Field(ge=0, le=2)] = 0.05
+    margin: NotNegative = 0.05
     """Points farther than this outside the support surface's outline belong to no object [m]."""
     edge_jump: Positive = 0.006
     """Distance of a sample from its neighbour's plane that separates surfaces [m]; at 1 m, grows with z²."""

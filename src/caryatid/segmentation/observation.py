@@ -20,7 +20,7 @@ from caryatid.segmentation.samples import Labels
 from caryatid.segmentation.seams import Pairs
 from caryatid.segmentation.segments import SMALLEST, segment, segment_cloud
 from caryatid.segmentation.support_plane import SupportSurface, find_support_surfaces, find_surface_below
-from caryatid.sensing.clouds import oriented_points, reduced, thin, working_distance
+from caryatid.sensing.clouds import average_pixels, oriented_points, thin, working_distance
 from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View
 
 WHOLE = 0.1
@@ -39,7 +39,7 @@ class Observation:
     """One view, perceived.
 
     Attributes:
-        view: The view, posed and thinned; None for a cloud.
+        view: The view, posed and at working resolution; None for a cloud.
         cloud: Oriented points in the world frame with labels: 0 nothing, 65535 the support surface.
         pixels: Flat index (N,) of each point in the image, or in the cloud it came from.
         surfaces: The support surfaces as this view shows them, the main one first.
@@ -133,12 +133,14 @@ def observe(
     if segmentation == "labels" and source.labels is None:
         raise InputError(source.name, "has no labels", "give masks, or segment with --segmentation auto")
     use_labels = source.labels is not None and segmentation != "auto"
-    source = thinned(source, config)
-    config = _without_stride(source, config)
+    source = resample(source, config)
     if isinstance(source, View) and source.T_world_camera is None:
         if known:
             raise InputError(source.name, "has no camera pose", "give one; only the first view may lack it")
         source = source.with_pose(level_transform(source, config, rng, use_labels=use_labels))
+    if isinstance(source, View) and source.depth.shape[1] < SMALLEST * config.segmentation.stride:
+        # Too few samples would leave the network out.
+        config = replace(config, segmentation=replace(config.segmentation, stride=1))
     if use_labels and isinstance(source, View):
         source = _with_whole_masks(source, 2.0 * config.segmentation.edge_jump)
     cloud, pixels = _points(source, config, known)
@@ -240,7 +242,7 @@ def label_image(observation: Observation, source: View | Cloud) -> NDArray[np.in
     return image
 
 
-def thinned(source: View | Cloud, config: Config) -> View | Cloud:
+def resample(source: View | Cloud, config: Config) -> View | Cloud:
     """Return a view with averaged pixels, so that samples are `cloud.voxel` apart at its working distance.
 
     Windows, segments and the network then see the sizes that they were made for, from near and from far.
@@ -248,14 +250,8 @@ def thinned(source: View | Cloud, config: Config) -> View | Cloud:
     if isinstance(source, Cloud) or (distance := working_distance(source, config.cloud)) == 0.0:
         return source
     spacing = config.segmentation.stride * distance / source.K[0, 0]
-    return reduced(source, max(1, min(int(config.cloud.voxel / spacing), *source.depth.shape)), config.cloud)
-
-
-def _without_stride(source: View | Cloud, config: Config) -> Config:
-    """Return the settings with which all pixels of an image too small for the network are samples."""
-    if isinstance(source, Cloud) or source.depth.shape[1] >= SMALLEST * config.segmentation.stride:
-        return config
-    return replace(config, segmentation=replace(config.segmentation, stride=1))
+    step = max(1, min(int(config.cloud.voxel / spacing), *source.depth.shape))
+    return average_pixels(source, step, config.cloud)
 
 
 def _points(
@@ -304,7 +300,7 @@ def level_transform(
         NoSurfaceError: There is no support surface.
         PerceptionError: There are no readings.
     """
-    source = thinned(source, config)
+    source = resample(source, config)
     cloud, pixels = _points(source, config)
     pose = np.eye(4)  # the source is in the frame of its camera
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None

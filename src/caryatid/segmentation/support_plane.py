@@ -36,6 +36,8 @@ BESIDE = 0.05
 MOST_PLANES = 6
 """Maximum number of planes, largest first, among which the surfaces of a first view are found [1]; in each
 later one, two more."""
+WIDEST = 200
+"""Maximum width of the border by which a region grows [squares]: 4 m, farther than a view shows."""
 MIDDLE = 5.0
 """Angle from the optical axis at which what an image shows counts 0.6 of what its middle does [deg]: a fifth
 of the way to its border."""
@@ -103,7 +105,7 @@ class Region:
         if margin < 0.0:
             depth = ndimage.distance_transform_edt(np.pad(self.squares, 1))[1:-1, 1:-1]
             return replace(self, squares=depth * self.size > self.size / 2.0 - margin)
-        border = int(np.ceil(margin / self.size))
+        border = min(int(np.ceil(margin / self.size)), WIDEST)
         squares = np.pad(self.squares, border)
         if border:
             squares = ndimage.distance_transform_edt(~squares) <= margin / self.size
@@ -116,6 +118,12 @@ class Region:
             return self
         inside = shapely.contains_xy(shapely.Polygon(corners), *np.indices(self.squares.shape))
         return replace(self, squares=self.squares | inside)
+
+    def trimmed(self) -> Region:
+        """The same squares on the smallest grid that holds them."""
+        x, y = (np.flatnonzero(self.squares.any(axis=k)) for k in (1, 0))
+        part = self.squares[x[0] : x[-1] + 1, y[0] : y[-1] + 1]
+        return Region(self.corner + (x[0], y[0]), part, self.size)
 
     def joined(self, other: Region) -> Region:
         """The squares of either region."""
@@ -217,12 +225,13 @@ class SupportSurface:
         through, hidden = np.zeros((2, *wide.squares.shape), dtype=np.bool_)
         through.ravel()[inside] = (z > 0.0) & (eye * (1.0 - share) < -config.tolerance)
         hidden.ravel()[inside] = (z > 0.0) & (eye * (1.0 - share) > -config.tolerance)
-        seen = np.pad(self.core.squares, int(np.ceil(config.gap / wide.size)))
+        seen = np.pad(self.core.squares, (len(wide.squares) - len(self.core.squares)) // 2)
         part, _ = ndimage.label(seen | (hidden & wide.squares))
         main = np.argmax(np.bincount(part[seen]))
         whole = replace(wide, squares=seen & (part == main)).filled().squares & ~through
         region = replace(wide, squares=(part == main) | whole)
-        return replace(self, core=replace(wide, squares=whole), region=region)
+        # Its grid would grow with every view.
+        return replace(self, core=replace(wide, squares=whole).trimmed(), region=region)
 
     def continues(self, other: SupportSurface, config: SurfaceConfig) -> bool:
         """Whether it is a part of another surface, which noise or a tilt sets off."""
@@ -249,11 +258,6 @@ class SupportSurface:
         # What is nearer hides the border.
         known = (z > 0.0) & (behind > -config.search)
         return bool(np.mean(behind[known] > config.search) > OPEN) if rooms and known.any() else True
-
-    def joined(self, known: SupportSurface) -> SupportSurface:
-        """Return the surface with the places where it was known."""
-        core = self.core.joined(known.core)
-        return replace(self, core=core, region=core.filled())
 
     def moved(self, T: Array) -> SupportSurface:
         """Return the surface moved by a rigid transform (4, 4) of the world, by less than a square."""
@@ -436,8 +440,7 @@ def find_support_surfaces(
         height, wide = surface.height(points), surface.region.grown(config.gap)
         near = left & (np.abs(height) < config.search) & wide.holds(points)
         plane = scene.largest_plane(_some(near, 1_000 if surfaces else 5_000), rng)
-        found = surface if plane is None else _surface(points, plane, config, surface.outline_world)
-        surfaces.append(found.joined(surface))
+        surfaces.append(surface if plane is None else _surface(points, plane, config, surface))
         left &= ~near
     planes: list[_Plane] = []
     left, most = (_some(left, 1_000), 2) if known else (left, MOST_PLANES)
@@ -544,17 +547,17 @@ def _choose_table(
 
 
 def _surface(
-    points: Array, plane: _Plane, config: SurfaceConfig, outline: Array | None = None
+    points: Array, plane: _Plane, config: SurfaceConfig, known: SupportSurface | None = None
 ) -> SupportSurface:
     """The surface of a plane: the hull of its points, and a box under the smallest rectangle around that.
 
-    The hull is also around the outline (M, 3) [m] known so far.
+    It holds all that is known of it.
     """
     on_plane = np.compress(plane.inliers, points, axis=0)
     centroid = np.array([x.mean() for x in on_plane.T])
     centroid = centroid - (plane.normal @ centroid - plane.offset) * plane.normal
     basis, thickness = _basis(plane.normal), 0.04
-    around = on_plane if outline is None else np.concatenate([on_plane, outline])
+    around = on_plane if known is None else np.concatenate([on_plane, known.outline_world])
     corners = hull(np.ascontiguousarray((around - centroid) @ basis.T))
     if len(corners) < 3:
         raise NoSurfaceError("no support surface: the points of the plane are collinear")
@@ -569,8 +572,9 @@ def _surface(
     centre = centroid + (middle[0] * x + middle[1] * y) @ basis - thickness / 2.0 * normal
     box = Box(transforms.rigid(R, centre), np.array([*sizes[:, best], thickness]))
     # If a cloud is not in metres, there are no more squares than memory holds.
-    size = max(config.spacing, float(np.ptp(on_plane[:, :2], axis=0).max()) / 1000.0)
-    core = Region.around(on_plane, size)
+    size = max(config.spacing, float(np.ptp(on_plane[:, :2], axis=0).max()) / 500.0)
+    core = Region.around(on_plane, size if known is None else known.core.size)
+    core = core if known is None else core.joined(known.core)
     return SupportSurface(plane.normal, centroid, centroid + corners @ basis, box, core, core.filled())
 
 

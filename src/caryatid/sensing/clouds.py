@@ -66,11 +66,11 @@ def working_distance(view: View, config: CloudConfig) -> float:
     return float(np.median(readings)) if len(readings) > 0 else 0.0
 
 
-def reduced(view: View, step: int, config: CloudConfig) -> View:
-    """Return a view with one pixel for each block of `step` × `step` pixels, whose readings are averaged.
+def average_pixels(view: View, step: int, config: CloudConfig) -> View:
+    """Return a view whose pixels are means over blocks of `step` × `step` pixels.
 
-    Readings beyond a depth edge of the block's median do not count; without readings in half of the block,
-    the pixel has none. Colours are means, and the other images those of the median reading.
+    Readings beyond a depth edge of the block's median do not count. Where half of the block has no reading,
+    the pixel has none. Labels and normals are those of the median reading.
     """
     if step == 1:
         return view
@@ -80,7 +80,7 @@ def reduced(view: View, step: int, config: CloudConfig) -> View:
     inverse_depth = np.divide(np.float32(1.0), view.depth, out=np.zeros_like(view.depth), where=view.valid)
     depth, pixels = np.zeros((height, width), np.float32), np.zeros((height, width), np.int64)
     jump = np.float32(config.edge_jump + slope_limit(view.K[0, 0], config) * (step - 1))
-    for_each(_average, SHARES, (inverse_depth, step, jump, depth, pixels))
+    for_each(_average_blocks, SHARES, (inverse_depth, step, jump, depth, pixels))
     images = dict[str, Any]()
     for name in ("labels", "normals_camera", "ignored"):
         if (image := getattr(view, name)) is not None:
@@ -93,7 +93,7 @@ def reduced(view: View, step: int, config: CloudConfig) -> View:
 
 
 @kernel
-def _average(share, data):  # type: ignore[no-untyped-def]
+def _average_blocks(share, data):  # type: ignore[no-untyped-def]
     """Write the mean depth of every 16th row of blocks, and the pixel with the median reading of each."""
     inverse_depth, step, jump, depth, pixels = data
     height, width = inverse_depth.shape

@@ -221,7 +221,7 @@ class ViewRegistration:
             other, sample = self._views[still], np.ascontiguousarray(self._views[moving].sample[::stride])
             return _find_correspondences(
                 *(sample, other.patches, other.starts, T[moving], T[still], transforms.invert(T[still])),
-                *(self._pivot, self._edge, reach),
+                *(self._pivot, self._edge, reach, self._config.noise),
             )
 
         return on_threads(work, len(pairs))
@@ -370,7 +370,7 @@ def _bucket(label, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _find_correspondences(samples, patches, starts, T, T_other, T_back, pivot, edge, reach):  # type: ignore[no-untyped-def]
+def _find_correspondences(samples, patches, starts, T, T_other, T_back, pivot, edge, reach, noise):  # type: ignore[no-untyped-def]
     """Find the patch of another view that is nearest in place and direction, and linearise the distance.
 
     Distance is along the mean of both normals, and its derivative by a move of either view that about the
@@ -398,7 +398,7 @@ def _find_correspondences(samples, patches, starts, T, T_other, T_back, pivot, e
         row[6] = (px - qx) * mx + (py - qy) * my + (pz - qz) * mz
         qx, qy, qz = 0.5 * (px + qx) - pivot[0], 0.5 * (py + qy) - pivot[1], 0.5 * (pz + qz) - pivot[2]
         row[3], row[4], row[5] = qy * mz - qz * my, qz * mx - qx * mz, qx * my - qy * mx
-        row[7] = 1.0 / (sample[6] + other[6])
+        row[7] = 1.0 / (sample[6] + other[6] + noise * noise)
     return rows
 
 

@@ -1,7 +1,7 @@
 """Surfels: the readings of a view averaged to small oriented patches, which registration matches.
 
 Patches are rows (P, 8): their readings' mean x, y, z [m] in the world as reported, unit normal, variance of
-the distance from their surface [m²], and label. Patches of different labels are
+the distance from their surface [m²] by the spread of the readings, and label. Patches of different labels are
 never the same surface.
 """
 
@@ -49,8 +49,8 @@ def surfels_of(
             enough[alike] = min(4, 0.33 * quantile(count[alike], 0.9))
     u, v, w = sums[:, 4:7].T / count
     length = np.sqrt(u * u + v * v + w * w)
-    # If the mean of the normals is shorter, there is an edge.
-    # A surface is level: patches of it that face elsewhere are noise, and would hold views in its plane.
+    # If the mean of the normals is shorter, there is an edge. Patches of a surface that are not level are
+    # noise, and would hold views in its plane.
     level = ~far | (w > MIN_COSINE * length)
     keep = np.flatnonzero((count >= enough) & (length > 0.97) & level)
     voxels, kinds, count = voxels[keep], kinds[keep], count[keep]
@@ -156,16 +156,8 @@ def _flattened(
     seem to determine positions in the plane.
     """
     sizes = np.bincount(side)
-    noise, table = config.noise, patches[:, 7] > MAX_LABEL
-    planes, widths, heights = _fit_planes(patches[:, :3], side, 1.5 * noise)
-    # The table shows the errors of depth that neighbouring readings share.
-    shared = 1.4826 * float(np.median(np.abs(heights[table]))) if table.any() else 0.0
-    if shared > noise:
-        noise = shared
-        planes, widths, heights = _fit_planes(patches[:, :3], side, 1.5 * noise)
-    # Half of what is expected of two patches.
-    patches[:, 6] += max(0.5 * config.noise**2, shared**2)
-    tolerance = 1.5 * noise
+    tolerance = 1.5 * config.noise
+    planes, widths, heights = _fit_planes(patches[:, :3], side, tolerance)
     plane = planes[side]
     agreement = np.sum(plane * patches[:, 3:6], axis=1)
     lies_in = (np.abs(heights) < 2.0 * tolerance) & (np.abs(agreement) > MIN_COSINE)
