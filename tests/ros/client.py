@@ -1,0 +1,114 @@
+"""A client of the node, in the process of the tests."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from caryatid_msgs.action import Explore
+from caryatid_msgs.msg import Decision, SupportGraph
+from caryatid_msgs.srv import Order, Refused, Removed
+from conftest import wait_for
+from rcl_interfaces.msg import Log
+from rcl_interfaces.srv import SetParameters
+from rclpy.action import ActionClient
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from table import DEFAULTS
+
+SERVICES = {"order": Order, "refused": Refused, "removed": Removed}
+
+
+class Goal:
+    """A goal that was sent.
+
+    Attributes:
+        handle: The goal handle, once it is answered.
+        feedback: What came so far.
+    """
+
+    def __init__(self, client: ActionClient, request: Any) -> None:
+        self.feedback: list[Any] = []
+        self.handle: Any = None
+        sent = client.send_goal_async(request, lambda message: self.feedback.append(message.feedback))
+        self.handle = wait_for(lambda: sent.done() and sent.result(), what="an answer to the goal")
+        self._result = self.handle.get_result_async() if self.handle.accepted else None
+
+    @property
+    def done(self) -> bool:
+        """Whether there is a result."""
+        return bool(self._result and self._result.done())
+
+    def result(self, seconds: float = 60.0) -> tuple[int, Any]:
+        """Wait for status and result."""
+        wait_for(lambda: self.done, seconds, "the end of the goal")
+        return self._result.result().status, self._result.result().result
+
+    def cancel(self, seconds: float = 5.0) -> bool:
+        """Cancel it; return whether that was accepted."""
+        answer = self.handle.cancel_goal_async()
+        wait_for(answer.done, seconds, "an answer to the cancel")
+        return len(answer.result().goals_canceling) == 1
+
+
+class Client(Node):
+    """Clients of all that the node offers; a context manager that spins meanwhile.
+
+    Attributes:
+        graphs, decisions, logs: What was published so far.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("client")
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.graphs: list[SupportGraph] = []
+        self.decisions: list[Decision] = []
+        self.logs: list[Log] = []
+        self.create_subscription(SupportGraph, "/support_graph", self.graphs.append, latched)
+        self.create_subscription(Decision, "/decision", self.decisions.append, 10)
+        self.create_subscription(Log, "/rosout", self.logs.append, 100)
+        self._explore = ActionClient(self, Explore, "/explore")
+        self._clients_of = {name: self.create_client(kind, f"/{name}") for name, kind in SERVICES.items()}
+        self._settings_of_table = self.create_client(SetParameters, "/table/set_parameters")
+
+    def __enter__(self) -> Client:
+        self._spinner = MultiThreadedExecutor(num_threads=2)
+        self._spinner.add_node(self)
+        self._thread = threading.Thread(target=self._spinner.spin, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._spinner.shutdown()
+        self._thread.join(5.0)
+        self.destroy_node()
+
+    def explore(self, **fields: Any) -> Goal:
+        """Send a goal."""
+        assert self._explore.wait_for_server(20.0), "there is no action server"
+        return Goal(self._explore, Explore.Goal(**fields))
+
+    def call(self, name: str, seconds: float = 30.0, **fields: Any) -> Any:
+        """Call a service, and return its response."""
+        return wait_for((answer := self.start_call(name, **fields)).done, seconds, name) and answer.result()
+
+    def start_call(self, name: str, **fields: Any) -> Any:
+        """Call a service, and return the future."""
+        assert self._clients_of[name].wait_for_service(20.0), f"there is no service {name}"
+        return self._clients_of[name].call_async(SERVICES[name].Request(**fields))
+
+    def set_table(self, **parameters: Any) -> None:
+        """Change parameters of the table; those that are not given get their defaults."""
+        assert self._settings_of_table.wait_for_service(20.0), "there is no table"
+        values = DEFAULTS | parameters
+        request = SetParameters.Request()
+        request.parameters = [
+            Parameter(name, value=value).to_parameter_msg()
+            for name, value in values.items()
+            if name not in ("scene", "width", "focal", "rate")
+        ]
+        answer = self._settings_of_table.call_async(request)
+        wait_for(answer.done, what="the table's answer")
+        assert all(result.successful for result in answer.result().results)

@@ -1,0 +1,147 @@
+"""The node on real ROS 2, in the environment of `make ros-test`: node, table and client are processes."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+collect_ignore = ["stand_ins", "table.py"]
+try:
+    import rclpy
+except ImportError:
+    collect_ignore += ["test_node.py"]
+
+HERE = Path(__file__).parent
+NODE = "-c", "from caryatid_ros.node import main; main()"
+TOPICS = {
+    "depth_topic": "/camera/depth",
+    "colour_topic": "/camera/colour",
+    "info_topic": "/camera/info",
+}
+
+
+class Process:
+    """A process whose output is kept.
+
+    Attributes:
+        lines: What it printed so far.
+    """
+
+    def __init__(self, *arguments: object, **parameters: object) -> None:
+        given = [f"-p {name}:={_yaml(value)}" for name, value in parameters.items()]
+        command = [sys.executable, *map(str, arguments)]
+        if given:
+            command += ["--ros-args", *" ".join(given).split()]
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ
+        )
+        self.lines: list[str] = []
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        self.lines += iter(self.process.stdout.readline, "")
+
+    @property
+    def text(self) -> str:
+        """All that it printed."""
+        return "".join(self.lines)
+
+    def stop(self, how: int = signal.SIGINT, wait: float = 10.0) -> tuple[int, float]:
+        """Send a signal; return the exit status, and the seconds until it ended."""
+        since = time.monotonic()
+        if self.process.poll() is None:
+            self.process.send_signal(how)
+        try:
+            status = self.process.wait(wait)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            status = self.process.wait()
+        return status, time.monotonic() - since
+
+
+def _yaml(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value).replace(" ", "")
+
+
+def wait_for(condition, seconds: float = 10.0, what: str = "it"):
+    """Return what a function returns once that is true; fail after a time [s]."""
+    end = time.monotonic() + seconds
+    while not (found := condition()):
+        assert time.monotonic() < end, f"{what} did not happen within {seconds:g} s"
+        time.sleep(0.02)
+    return found
+
+
+@pytest.fixture(scope="session", autouse=True)
+def domain():
+    """A ROS domain of its own on this machine, and this process as a client in it."""
+    os.environ |= {
+        "ROS_DOMAIN_ID": str(random.SystemRandom().randint(1, 100)),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_PYTHON_CHECK_FIELDS": "1",
+        "PYTHONUNBUFFERED": "1",
+    }
+    rclpy.init()
+    yield
+    rclpy.try_shutdown()
+
+
+@pytest.fixture(scope="module")
+def table():
+    """The table's process; `client.set_table` changes its parameters."""
+    process = Process(HERE / "table.py")
+    yield process
+    process.stop()
+
+
+@pytest.fixture
+def start_node():
+    """Start the node with parameters; it is stopped at the end of the test."""
+    started = []
+
+    def start(*arguments: object, **parameters: object) -> Process:
+        node = Process(*NODE, *arguments, **TOPICS | parameters)
+        started.append(node)
+        return node
+
+    yield start
+    for node in started:
+        node.stop()
+
+
+@pytest.fixture(scope="module")
+def node(table):
+    """A node with default parameters, which the tests of a module share."""
+    process = Process(*NODE, **TOPICS, image_timeout=3.0, move_timeout=5.0)
+    yield process
+    process.stop()
+
+
+@pytest.fixture(scope="module")
+def client():
+    """A client of node and table."""
+    from client import Client
+
+    with Client() as found:
+        yield found
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    """Show what node and table printed beside a failure."""
+    report = yield
+    if report.failed:
+        for name in ("node", "table"):
+            process = item.funcargs.get(name)
+            if isinstance(process, Process):
+                report.sections.append((name, process.text))
+    return report

