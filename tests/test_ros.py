@@ -1,48 +1,42 @@
-"""The ROS 2 package without ROS: messages of rosbags' types, a simulated robot, stand-ins for rclpy."""
+"""The ROS 2 package without ROS: messages of rosbags' types. `tests/ros` has the node on real ROS 2."""
 
 from __future__ import annotations
 
 import array
 import ast
-import importlib
 import re
 import sys
 import xml.etree.ElementTree as ET
 from dataclasses import astuple, replace
-from dataclasses import fields as dataclass_fields
 from pathlib import Path
 from types import SimpleNamespace
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import yaml
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from synthetic import (
-    FEW_VIEWS,
     TABLE_TOP,
     box,
     cylinder,
     shelf_graph,
-    simulated_scene,
     sphere,
     table_object,
     thing,
 )
 
-from caryatid.config.settings import write_settings
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.solids import Polytope, Solid
 from caryatid.graph import Change, Grasp, Support, SupportGraph, TakeStep
-from caryatid.manipulation.order import Order, plan_order
-from caryatid.simulation.setup import make_simulation
+from caryatid.manipulation.order import Order
 
 ROS = Path(__file__).parents[1] / "ros"
 CODE = ROS / "caryatid_ros/caryatid_ros"
 sys.path.insert(0, str(CODE.parent))
 
 from caryatid_ros import messages  # noqa: E402
-from caryatid_ros.exploration import Connection, Exploration, Settings  # noqa: E402
+from caryatid_ros.inbox import Inbox, seconds_of  # noqa: E402
 
 INTERFACES = sorted(path for kind in ("msg", "srv", "action") for path in ROS.glob(f"caryatid_msgs/{kind}/*"))
 PARTS = {".msg": ("",), ".srv": ("_Request", "_Response"), ".action": ("_Goal", "_Result", "_Feedback")}
@@ -99,97 +93,6 @@ def image(pixels, encoding, time=1.0, padding=0):
 def camera_info(view):
     height, width = view.depth.shape
     return make("sensor_msgs/msg/CameraInfo", height=height, width=width, k=view.K.ravel())
-
-
-def transform_message(T):
-    pose = messages.pose_message(make, T)
-    shift = make("geometry_msgs/msg/Vector3", x=pose.position.x, y=pose.position.y, z=pose.position.z)
-    return make("geometry_msgs/msg/Transform", translation=shift, rotation=pose.orientation)
-
-
-class Bench:
-    """A robot whose camera takes views, seen through the calls that the logic makes of a node."""
-
-    def __init__(self, folder, capture, T_world_camera=None, config=FEW_VIEWS):
-        self.capture, self.T_world_camera, self.time = capture, T_world_camera, 100.0
-        self.seen, self.poses, self.published, self.frame = [], [], [], "map"
-        (folder / "settings.toml").write_text(write_settings(config))
-        self.masks = folder / "masks"
-        self.masks.mkdir()
-        files = {"config": str(folder / "settings.toml"), "masks": str(self.masks)}
-        settings = Settings(**files, seed=3, move_timeout=2.0)
-        names = ("images", "lookup", "publish", "now", "sleep")
-        self.logic = Exploration(settings, Connection(**{n: getattr(self, n) for n in names}, make=make))
-
-    def images(self):
-        view = self.capture(self.T_world_camera)
-        self.time += 1.0
-        np.save(self.masks / f"{self.time:.3f}.npy", view.labels)
-        self.seen.append((image(view.depth, "32FC1", self.time), camera_info(view), image(view.rgb, "rgb8")))
-        return self.seen[-1]
-
-    def lookup(self, target, source, stamp):
-        if (target, source) != (self.frame, "lens"):
-            raise LookupError("no such frame")
-        found = transform_message(self.T_world_camera)
-        if stamp is not None:
-            self.poses.append(messages.matrix_of(found.rotation, found.translation, "view"))
-        return make("geometry_msgs/msg/TransformStamped", transform=found)
-
-    def publish(self, name, message):
-        self.published.append((name, packed(message)))
-
-    def now(self):
-        return self.time
-
-    def sleep(self, seconds):
-        self.time += seconds
-
-
-class Handle:
-    """A goal handle; its client moves the camera to each next view, but refuses the first few."""
-
-    def __init__(self, bench, moves=True, refuses=0, cancel_at=None, **goal):
-        self.request = make("caryatid_msgs/action/Explore/Goal", **goal)
-        self.bench, self.moves, self.refuses = bench, moves, refuses
-        self.cancel_at, self.feedback, self.ended = cancel_at, [], []
-        self.succeed, self.abort, self.canceled = (
-            lambda end=end: self.ended.append(end) for end in ("succeeded", "aborted", "canceled")
-        )
-
-    @property
-    def is_cancel_requested(self):
-        return self.cancel_at == len(self.feedback)
-
-    def publish_feedback(self, message):
-        self.feedback.append(packed(message))
-        pose = message.decision.camera.pose
-        if len(self.feedback) <= self.refuses:
-            told = self.bench.logic.refused(make("caryatid_msgs/srv/Refused/Request", reason="no path"))
-            assert packed(told).success
-        elif self.moves:
-            T = messages.matrix_of(pose.orientation, pose.position, "camera")
-            self.bench.T_world_camera = T
-
-    def run(self):
-        result = packed(self.bench.logic.explore(self))
-        return *self.ended, result
-
-
-def simulated(folder):
-    """A bench of a simulated robot."""
-    simulation = make_simulation(simulated_scene("tower"), FEW_VIEWS, noise="none", seed=0)
-    return Bench(folder, simulation.camera.capture, simulation.robot.T_world_camera)
-
-
-@pytest.fixture(scope="module")
-def explored(tmp_path_factory):
-    """A bench after a goal of three views, with handle and result."""
-    bench = simulated(tmp_path_factory.mktemp("ros"))
-    handle = Handle(bench, max_views=3)
-    end, result = handle.run()
-    assert (end, result.message, result.views) == ("succeeded", "maximum of 3 views reached", 3)
-    return bench, handle, result
 
 
 def test_a_graph_survives_the_way_to_another_node():
@@ -279,91 +182,64 @@ def test_images_become_a_view(views):
         messages.matrix_of(zero, make("geometry_msgs/msg/Point"), "pose")
 
 
-def test_explore_tells_each_next_view_and_publishes_each_graph(explored):
-    bench, handle, result = explored
-    assert len(handle.feedback) == 2
-    for message, T_world_camera in zip(handle.feedback, bench.poses[1:], strict=True):
-        pose = message.decision.camera.pose
-        np.testing.assert_allclose(
-            messages.matrix_of(pose.orientation, pose.position, ""), T_world_camera, atol=1e-12
-        )
-    assert np.linalg.norm(np.diff(bench.poses, axis=0)[:, :3, 3], axis=1).min() > 0.3
-    assert len(result.graph.objects) == 6
-    assert len(result.graph.supports) == 5
-    names = [name for name, _ in bench.published]
-    assert names == ["support_graph", "markers", "decision"] * 2 + ["support_graph", "markers"]
-    assert repr(bench.published[-2][1]) == repr(result.graph)
-    assert result.graph.header.frame_id == handle.feedback[0].decision.camera.header.frame_id == "map"
+def test_the_camera_info_must_be_that_of_a_pinhole(views):
+    view, info = views[0], camera_info(views[0])
+    depth = image(view.depth, "32FC1")
+
+    def taken(rectified=False, **changed):
+        return messages.view_of(depth, replace(info, **changed), None, view.pose, rectified=rectified).K
+
+    P = np.column_stack([view.K * [[1.1], [1.1], [1.0]], np.zeros(3)])
+    np.testing.assert_array_equal(taken(), view.K)
+    np.testing.assert_array_equal(taken(p=P.ravel()), P[:, :3])
+    np.testing.assert_array_equal(taken(True, p=P.ravel(), d=np.full(5, 0.1)), P[:, :3])
+    whole = make("sensor_msgs/msg/RegionOfInterest", width=info.width, height=info.height)
+    np.testing.assert_array_equal(taken(roi=whole, binning_x=1, binning_y=1), view.K)
+    part = make("sensor_msgs/msg/RegionOfInterest", width=80, height=60)
+    for wrong, said in (({"d": np.full(5, 0.1)}, "distortion"), ({"binning_x": 2}, "binning 2 × 0"),
+                        ({"roi": part}, "region of interest, 80 × 60")):  # fmt: skip
+        with pytest.raises(InputError, match=f"camera info: has (a )?{said}"):
+            taken(**wrong)
 
 
-def test_order_and_removed_do_what_the_library_does(explored):
-    bench, _, _ = explored
-    scene = bench.logic._explorer.scene.copy()
-    wanted = plan_order(scene.graph, FEW_VIEWS, steps=1, hands=1, seed=3)
-    told = packed(bench.logic.order(make("caryatid_msgs/srv/Order/Request", steps=1, hands=1)))
-    assert (told.success, told.safe) == (True, wanted.safe)
-    assert [(s.object, s.risk, s.why) for s in told.lifts] == [
-        (s.object_id, s.risk, s.why) for s in wanted.steps
-    ]
-    assert told.lifts[0].grasp == []
-    first = wanted.steps[0].object_id
-    told = packed(bench.logic.removed(make("caryatid_msgs/srv/Removed/Request", object=first)))
-    assert [o.id for o in told.graph.objects] == [o.id for o in scene.removed(first).objects]
-    assert [(c.kind, c.object) for c in told.graph.changes] == [("removed", first)]
-    end, result = Handle(bench, max_views=1, goal="o99").run()
-    assert (end, result.message) == ("succeeded", "maximum of 1 views reached; o99 was not found")
-    assert bench.logic._explorer.scene.views == 4, "goals continue the scene"
-    Handle(bench, max_views=1, restart=True).run()
-    assert bench.logic._explorer.scene.views == 1
+TOPICS = {"depth": "/depth", "info": "/info", "colour": "/colour"}
 
 
-@pytest.fixture
-def bench(tmp_path):
-    return simulated(tmp_path)
+def arrived(depths, colours, **frames):
+    """An inbox in which images of these times arrived, after a camera info."""
+    inbox = Inbox(TOPICS)
+    inbox.put("info", make("sensor_msgs/msg/CameraInfo"))
+    for what, times in (("depth", depths), ("colour", colours)):
+        for time in times:
+            message = image(np.zeros((1, 1)), "mono8", time)
+            message.header.frame_id = frames.get(what, "lens")
+            inbox.put(what, message)
+    return inbox
 
 
-def test_a_cancelled_goal_stops_before_the_next_view(bench):
-    end, result = Handle(bench, moves=False, cancel_at=1).run()
-    assert (end, result.message, result.views, len(bench.seen)) == ("canceled", "cancelled", 1, 1)
-    assert len(result.graph.objects) > 1
+def test_images_are_matched_by_their_stamps():
+    inbox = arrived([1.0, 2.0, 3.0, 4.0], [1.99, 0.5, 3.01])
+    found = [[seconds_of(m.header.stamp) for m in (d, c)] for d, _, c in inbox.views(1.5, 0.02)]
+    np.testing.assert_allclose(found, [[3.0, 3.01], [2.0, 1.99]])
 
 
-def test_a_view_that_the_motion_planner_refuses_is_replaced_by_another(bench):
-    handle = Handle(bench, refuses=2, max_views=2)
-    end, result = handle.run()
-    assert (end, result.message, len(handle.feedback)) == ("succeeded", "maximum of 2 views reached", 3)
-    assert len({repr(message.decision.camera.pose) for message in handle.feedback}) == 3
-    end, result = Handle(bench, refuses=99, max_views=2).run()
-    assert (end, result.message) == ("succeeded", "the robot refused 20 views in a row: no path")
-    told = packed(bench.logic.refused(make("caryatid_msgs/srv/Refused/Request")))
-    assert (told.success, told.message) == (False, "no next view is awaited")
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (([], [1.0]), "/depth: no message arrived, but 1 on /info, 1 on /colour"),
+        (([1.0], []), "/colour: no message arrived, but 1 on /depth, 1 on /info"),
+        (([0.5], [0.5]), "/depth: its newest image is 0.500 s older than the goal"),
+        (([1.0, 2.0], [1.3, 1.5]), "/depth: stamps of depth and colour images differ by 0.300 s or more"),
+    ],
+)
+def test_the_inbox_says_why_there_is_no_view(given, said):
+    with pytest.raises(InputError, match=re.escape(said)):
+        list(arrived(*given).views(1.0, 0.02))
 
 
-def test_what_goes_wrong_ends_in_one_sentence(bench):
-    reply = packed(bench.logic.order(make("caryatid_msgs/srv/Order/Request")))
-    assert (reply.success, reply.message) == (False, "scene: has no views; send a goal to explore first")
-    bench.frame = "odom"
-    said = ended_in(bench)
-    assert said.startswith("transform map ← lens: is unknown at 101.000 s (no such frame); publish it in tf")
-    bench.frame, images = "map", bench.images
-    bench.logic._ros = replace(bench.logic._ros, images=lambda: (images()[2], *images()[1:]))
-    bench.time = 0.0
-    assert ended_in(bench).startswith("depth image: its encoding 'rgb8' is not supported; ")
-    bench.logic._ros = replace(bench.logic._ros, images=lambda: None)
-    assert "no image in 5 s: none arrived; check the topics" in ended_in(bench)
-    bench.logic._ros = replace(bench.logic._ros, images=lambda: images())
-    said = ended_in(bench, moves=False)
-    assert re.fullmatch(r"camera: is \d\.\d\d m and .* after 2 s; move it there, .*", said)
-    assert ended_in(bench, until=0.4).startswith("until: 0.4 is not above 0.5")
-    bench.logic._goal_lock.acquire()
-    assert ended_in(bench) == "explore: another goal is running; cancel it, or wait for its result"
-
-
-def ended_in(bench, **goal):
-    end, result = Handle(bench, **goal).run()
-    assert end == "aborted"
-    assert "\n" not in result.message
-    return result.message
+def test_depth_that_is_not_registered_to_colour_is_refused():
+    with pytest.raises(InputError, match="colour image: has frame 'eye', the depth image has 'lens'"):
+        list(arrived([1.0], [1.0], colour="eye").views(0.0, 0.02))
 
 
 # The packages
@@ -389,138 +265,20 @@ def test_the_packages_name_what_they_need():
     code = "".join(path.read_text() for path in CODE.glob("*.py"))
     made = set(re.findall(r'"(\w+)/(?:msg|srv|action)/\w+', code))
     assert (used | made) - known <= needs["caryatid_ros"]
-    for library, home in (("rclpy", "node"), ("tf2_ros", "node"), ("py_trees", "leaves")):
-        assert [name for name, found in ours.items() if library in found] == [home]
+    assert not {"rclpy", "py_trees"} & (ours["messages"] | ours["inbox"]), "which other nodes use"
     listed = (ROS / "caryatid_msgs/CMakeLists.txt").read_text()
     assert all(f'"{path.parent.name}/{path.name}"' in listed for path in INTERFACES)
     params = (CODE.parent / "launch/params.yaml").read_text()
-    listed_params = dict(re.findall(r"^    (\w+): \"?(.*?)\"? +#", params, re.M))
-    assert listed_params == {f.name: str(f.default) for f in dataclass_fields(Settings)}
+    listed_params = dict(re.findall(r"^    (\w+): (.*?) +#", params, re.M))
+    tree = ast.parse((CODE / "parameters.py").read_text())
+    declared = {
+        n.target.id: n.value.args[0].value
+        for n in ast.walk(tree)
+        if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)
+    }
+    assert {name: yaml.safe_load(text) for name, text in listed_params.items()} == declared
     fields = [line for p in INTERFACES for line in p.read_text().splitlines() if line and line[0] not in "#-"]
     assert all(" # " in line for line in fields), "every field says what it is, and its unit"
     others = {match[1] for line in fields if (match := re.match(r"(\w+)/", line))} - {"caryatid_msgs"}
     assert others <= needs["caryatid_msgs"]
     assert all(f"find_package({other} REQUIRED)" in listed for other in others)
-
-
-class Answer:
-    """A future of rclpy."""
-
-    def __init__(self, value=None):
-        self.value = value
-
-    def done(self):
-        return self.value is not None
-
-    def result(self):
-        return self.value
-
-    def add_done_callback(self, call):
-        call(self)
-
-
-@pytest.fixture
-def leaves(monkeypatch):
-    """The leaves, with py_trees or a stand-in for what they use of it."""
-    if importlib.util.find_spec("py_trees") is None:
-        status = SimpleNamespace(RUNNING="RUNNING", SUCCESS="SUCCESS", FAILURE="FAILURE", INVALID="INVALID")
-
-        class Behaviour:
-            def __init__(self, name):
-                self.name, self.status, self.feedback_message = name, status.INVALID, ""
-
-            def tick_once(self):
-                if self.status != status.RUNNING:
-                    self.initialise()
-                self.status = self.update()
-
-            def stop(self, new_status):
-                self.terminate(new_status)
-                self.status = new_status
-
-        Behaviour.terminate = lambda self, new_status: None
-        parts = {"": {}, ".behaviour": {"Behaviour": Behaviour}, ".common": {"Status": status}}
-        for name, holds in parts.items():
-            monkeypatch.setitem(sys.modules, f"py_trees{name}", SimpleNamespace(**holds))
-    yield importlib.import_module("caryatid_ros.leaves")
-    del sys.modules["caryatid_ros.leaves"]
-
-
-def test_a_leaf_for_each_verb(leaves):
-    status, went, client = leaves.Status, [], MagicMock()
-    leaf = leaves.Explore(client, went.append, make=make, max_views=4)
-    sent, answer = Answer(), Answer()
-    client.send_goal_async.return_value = sent
-    leaf.tick_once()
-    assert leaf.status == status.RUNNING
-    assert client.send_goal_async.call_args.args[0].max_views == 4
-    sent.value = MagicMock(accepted=True, get_result_async=lambda: answer)
-    leaf.tick_once()
-    feedback = make("caryatid_msgs/action/Explore/Feedback")
-    client.send_goal_async.call_args.kwargs["feedback_callback"](SimpleNamespace(feedback=feedback))
-    assert went == [feedback.decision]
-    result = make("caryatid_msgs/action/Explore/Result", message="no further view is worth its path")
-    for code, wanted in ((4, status.SUCCESS), (6, status.FAILURE)):
-        answer.value = SimpleNamespace(status=code, result=result)
-        leaf.tick_once()
-        assert (leaf.status, leaf.feedback_message, leaf.result) == (wanted, result.message, result)
-    answer.value = None
-    leaf.tick_once()
-    leaf.stop(status.INVALID)
-    sent.value.cancel_goal_async.assert_called_once()
-
-    lift = make("caryatid_msgs/msg/Lift", object="o4")
-    order = leaves.order(client, make=make, hands=1)
-    client.call_async.return_value = sent = Answer()
-    order.tick_once()
-    assert (order.status, client.call_async.call_args.args[0].hands) == (status.RUNNING, 1)
-    for safe, wanted in ((False, status.FAILURE), (True, status.SUCCESS)):
-        sent.value = make("caryatid_msgs/srv/Order/Response", success=True, safe=safe, lifts=[lift])
-        order.tick_once()
-        assert order.status == wanted
-    removed = leaves.removed(client, lambda: order.response.lifts[0].object, make=make)
-    sent.value = make("caryatid_msgs/srv/Removed/Response", success=True)
-    removed.tick_once()
-    assert (removed.status, client.call_async.call_args.args[0].object) == (status.SUCCESS, "o4")
-
-
-def test_the_node_connects_its_topics(monkeypatch):
-    class Node:
-        declared, create_publisher, create_service = {}, MagicMock(), MagicMock()
-        get_clock = MagicMock()
-
-        def __init__(self, name):
-            assert name == "caryatid"
-
-        def declare_parameter(self, name, value):
-            return SimpleNamespace(value=self.declared.setdefault(name, value))
-
-    class LostError(Exception):
-        pass
-
-    needed = [name for name in imports(CODE / "node.py") if name not in sys.stdlib_module_names]
-    for name in {*needed} - {"caryatid", "caryatid_ros"}:
-        for module in (name, *(f"{name}.{part}" for part in ("msg", "srv", "action", "node", "qos", "time",
-                               "callback_groups", "duration", "executors"))):  # fmt: skip
-            monkeypatch.setitem(sys.modules, module, MagicMock())
-    sys.modules["rclpy.node"].Node, sys.modules["tf2_ros"].TransformException = Node, LostError
-    monkeypatch.delitem(sys.modules, "caryatid_ros.node", raising=False)
-    node = importlib.import_module("caryatid_ros.node").ExplorationNode()
-    monkeypatch.delitem(sys.modules, "caryatid_ros.node")
-    assert Node.declared == {name: getattr(Settings(), name) for name in Settings.__dataclass_fields__}
-    filters = sys.modules["message_filters"]
-    topics = [call.args[2] for call in filters.Subscriber.call_args_list]
-    assert topics == [node.settings.depth_topic, node.settings.info_topic, node.settings.colour_topic]
-    (take,) = filters.ApproximateTimeSynchronizer.return_value.registerCallback.call_args.args
-    take("depth", "info", "colour")
-    assert node.logic._ros.images() == ("depth", "info", "colour")
-    assert [call.args[1] for call in Node.create_publisher.call_args_list] == [
-        "support_graph",
-        "markers",
-        "decision",
-    ]
-    assert [call.args[1] for call in Node.create_service.call_args_list] == ["order", "removed", "refused"]
-    assert sys.modules["rclpy.action"].ActionServer.call_args.args[2:] == ("explore", node.logic.explore)
-    sys.modules["tf2_ros"].Buffer.return_value.lookup_transform.side_effect = LostError("two trees")
-    with pytest.raises(LookupError, match="two trees"):
-        node.logic._ros.lookup("map", "lens", None)

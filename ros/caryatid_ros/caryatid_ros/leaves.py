@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from caryatid_msgs.action import Explore as Action
+from caryatid_msgs.srv import Order, Removed
 from py_trees.behaviour import Behaviour
 from py_trees.common import Status
-
-from caryatid_ros.messages import Make, make_message
 
 SUCCEEDED = 4
 """Status of a goal that succeeded, in action_msgs/GoalStatus."""
@@ -20,29 +20,30 @@ SUCCEEDED = 4
 class Explore(Behaviour):
     """Explore; succeeds when no further view is worth its path. An interruption cancels the goal.
 
+    It fails if there is no server, or if the server goes away.
+
     Args:
         client: `rclpy.action.ActionClient` of `explore`.
         go_to: Called with each Decision; starts the camera's motion to `decision.camera`, and returns.
-        make: Makes a message.
         goal: Fields of the goal, such as `max_views=5`.
 
     Attributes:
         result: The newest result, or None.
     """
 
-    def __init__(
-        self, client: Any, go_to: Callable[[Any], object], *, make: Make = make_message, **goal: Any
-    ) -> None:
+    def __init__(self, client: Any, go_to: Callable[[Any], object], **goal: Any) -> None:
         super().__init__("explore")
-        self._client, self._go_to, self._make, self._goal = client, go_to, make, goal
+        self._client, self._go_to, self._goal = client, go_to, goal
         self.result: Any = None
+        self._sent: Any = None
         self._answer: Any = None
 
     def initialise(self) -> None:
         """Send the goal."""
-        self.result, self._answer = None, None
-        goal = self._make("caryatid_msgs/action/Explore/Goal", **self._goal)
-        self._sent = self._client.send_goal_async(goal, feedback_callback=self._decided)
+        self.result, self._sent, self._answer = None, None, None
+        if self._client.server_is_ready():
+            goal = Action.Goal(**self._goal)
+            self._sent = self._client.send_goal_async(goal, feedback_callback=self._decided)
 
     def _decided(self, message: Any) -> None:
         self.feedback_message = message.feedback.decision.why
@@ -50,6 +51,10 @@ class Explore(Behaviour):
 
     def update(self) -> Status:
         """Return whether the goal is running, succeeded or failed."""
+        ended = self._answer is not None and self._answer.done()
+        if self._sent is None or not (ended or self._client.server_is_ready()):
+            self.feedback_message = "there is no action server explore"
+            return Status.FAILURE
         if not self._sent.done():
             return Status.RUNNING
         handle = self._sent.result()
@@ -66,7 +71,12 @@ class Explore(Behaviour):
     def terminate(self, new_status: Status) -> None:
         """Cancel a goal that is interrupted, as soon as it is accepted."""
         if self.status == Status.RUNNING and new_status == Status.INVALID:
-            self._sent.add_done_callback(lambda sent: sent.result().cancel_goal_async())
+            self._sent.add_done_callback(_cancel)
+
+
+def _cancel(sent: Any) -> None:
+    if sent.result().accepted:
+        sent.result().cancel_goal_async()
 
 
 class Call(Behaviour):
@@ -88,14 +98,19 @@ class Call(Behaviour):
         super().__init__(name)
         self._client, self._request, self._good = client, request, good
         self.response: Any = None
+        self._sent: Any = None
 
     def initialise(self) -> None:
         """Send the request."""
         self.response = None
-        self._sent = self._client.call_async(self._request())
+        ready = self._client.service_is_ready()
+        self._sent = self._client.call_async(self._request()) if ready else None
 
     def update(self) -> Status:
         """Return whether the response is outstanding, good or bad."""
+        if self._sent is None or not (self._sent.done() or self._client.service_is_ready()):
+            self.feedback_message = f"there is no service {self.name}"
+            return Status.FAILURE
         if not self._sent.done():
             return Status.RUNNING
         self.response = self._sent.result()
@@ -103,17 +118,13 @@ class Call(Behaviour):
         return Status.SUCCESS if self._good(self.response) else Status.FAILURE
 
 
-def order(client: Any, *, make: Make = make_message, **request: Any) -> Call:
+def order(client: Any, **request: Any) -> Call:
     """Plan a removal order, such as with `hands=2`; the leaf succeeds if every lift of it is safe."""
     return Call(
-        "order", client, lambda: make("caryatid_msgs/srv/Order/Request", **request),
-        lambda response: response.success and response.safe,
-    )  # fmt: skip
+        "order", client, lambda: Order.Request(**request), lambda response: response.success and response.safe
+    )
 
 
-def removed(client: Any, which: Callable[[], str], *, make: Make = make_message) -> Call:
+def removed(client: Any, which: Callable[[], str]) -> Call:
     """Report that an object was removed; `which` returns its id when the leaf starts."""
-    return Call(
-        "removed", client, lambda: make("caryatid_msgs/srv/Removed/Request", object=which()),
-        lambda response: response.success,
-    )  # fmt: skip
+    return Call("removed", client, lambda: Removed.Request(object=which()), lambda response: response.success)

@@ -24,6 +24,7 @@ from caryatid.manipulation.order import Order
 from caryatid.planning.decision import Decision
 from caryatid.sensing.views import View
 from caryatid.viz.colours import object_colour, rgb
+from caryatid_ros.inbox import seconds_of
 
 Make = Callable[..., Any]
 """Makes a message: `make("geometry_msgs/msg/Point", x=1.0)`; other fields keep their defaults."""
@@ -43,11 +44,6 @@ def make_message(name: str, **fields: Any) -> Any:
     return found(**fields)
 
 
-def seconds_of(stamp: Any) -> float:
-    """Time [s] of a builtin_interfaces/Time."""
-    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
-
-
 def matrix_of(rotation: Any, translation: Any, name: str) -> Array:
     """A pose or transform as a matrix (4, 4), from its quaternion and its translation [m].
 
@@ -61,7 +57,7 @@ def matrix_of(rotation: Any, translation: Any, name: str) -> Array:
     return transforms.as_rigid(transforms.rigid(R, (translation.x, translation.y, translation.z)), name)
 
 
-def view_of(depth: Any, info: Any, colour: Any, T_world_camera: Array) -> View:
+def view_of(depth: Any, info: Any, colour: Any, T_world_camera: Array, *, rectified: bool = True) -> View:
     """The view of a depth image, its camera, and a colour image of the same size.
 
     Args:
@@ -69,9 +65,10 @@ def view_of(depth: Any, info: Any, colour: Any, T_world_camera: Array) -> View:
         info: sensor_msgs/CameraInfo of the depth image.
         colour: sensor_msgs/Image or CompressedImage, or None.
         T_world_camera: Pose (4, 4) of the image's optical frame.
+        rectified: Whether the images are free of the distortion that the camera info describes.
 
     Raises:
-        InputError: An encoding is unknown, data is missing, or sizes differ.
+        InputError: An encoding is unknown, data is missing, sizes differ, or the camera is not a pinhole.
     """
     pixels = RecordingConfig().max_pixels
     metres = decode_depth(depth, "depth image", pixels)
@@ -81,7 +78,24 @@ def view_of(depth: Any, info: Any, colour: Any, T_world_camera: Array) -> View:
         raise InputError("camera info", reason, "use the camera info of the aligned depth image")
     image = None if colour is None else decode_colour(colour, "colour image", pixels)
     name = f"{seconds_of(depth.header.stamp):.3f}"
-    return View(metres, np.reshape(info.k, (3, 3)), T_world_camera, image, name=name)
+    return View(metres, _pinhole(info, rectified), T_world_camera, image, name=name)
+
+
+def _pinhole(info: Any, rectified: bool) -> Array:
+    """Camera matrix (3, 3) of whole, undistorted images."""
+    if max(info.binning_x, info.binning_y) > 1:
+        reason = f"has binning {info.binning_x} × {info.binning_y}"
+        raise InputError("camera info", reason, "publish images without binning")
+    part = [info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height]
+    if any(part) and part != [0, 0, info.width, info.height]:
+        reason = f"has a region of interest, {part[2]} × {part[3]} pixels at ({part[0]}, {part[1]})"
+        raise InputError("camera info", reason, "publish whole images")
+    if np.any(info.d) and not rectified:
+        reason = f"has distortion, d = {np.round(info.d, 4).tolist()}, and the images are not rectified"
+        remedy = "use rectified topics, such as image_rect of image_proc; if they are, set rectified"
+        raise InputError("camera info", reason, remedy)
+    P = np.reshape(info.p, (3, 4))[:, :3]
+    return P if P[0, 0] > 0.0 else np.reshape(info.k, (3, 3))
 
 
 def pose_message(make: Make, T: Array) -> Any:
@@ -107,6 +121,7 @@ def _object(make: Make, o: SceneObject) -> Any:
         id=o.id, label=int(o.label), role=o.role, shape=o.shape.kind, occurrences=int(o.occurrences),
         pose=pose_message(make, o.shape.T_world_object), extents=_vector(make, o.shape.extents),
         probability=float("nan") if o.probability is None else float(o.probability), doubt=o.doubt,
+        triangles=_corners(make, o.shape) if o.shape.kind not in SHAPES else [],
     )  # fmt: skip
 
 
@@ -170,8 +185,7 @@ def markers_message(make: Make, graph: SupportGraph, header: Any) -> Any:
         kind, colour = SHAPES.get(o.shape.kind, TRIANGLES), object_colour(o.label)
         drawn = {"pose": pose_message(make, o.shape.T_world_object)}
         if kind == TRIANGLES:
-            corners = o.shape.mesh().triangles.reshape(-1, 3)
-            drawn |= {"scale": _vector(make, np.ones(3)), "points": [_point(make, p) for p in corners]}
+            drawn |= {"scale": _vector(make, np.ones(3)), "points": _corners(make, o.shape)}
         else:
             drawn["scale"] = _vector(make, o.shape.extents)
         marker("shapes", kind, colour, 0.8, **drawn)
@@ -187,6 +201,11 @@ def markers_message(make: Make, graph: SupportGraph, header: Any) -> Any:
         points, scale = [_point(make, start), _point(make, end)], _vector(make, (width, 2.5 * width, 0.0))
         marker("supports", ARROW, "#202020", 1.0, points=points, scale=scale)
     return make("visualization_msgs/msg/MarkerArray", markers=found)
+
+
+def _corners(make: Make, shape: Shape) -> list[Any]:
+    """Three corners of each triangle of a shape, along its own axes."""
+    return [_point(make, p) for p in shape.mesh().triangles.reshape(-1, 3)]
 
 
 def _half_height(shape: Shape) -> float:

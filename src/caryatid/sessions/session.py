@@ -292,9 +292,7 @@ class Session:
         if isinstance(view, Capture):
             view = view.decode(self.beginning.settings.recording.max_pixels)
         view = view if self._ignored is None else replace(view, ignored=self._ignored)
-        content = pack(replace(view, name=""))
-        name = view.name.encode(errors="replace").decode()  # that of a file may not be text
-        event = Event("view", name, self.views, hashlib.sha256(content).hexdigest(), view.T_world_camera)
+        event, content = self._packed(view)
         if number is not None and number != self.views:
             if not 0 <= number == self.views - 1 or event.digest != self._views[-1].digest:
                 reason = f"has number {number}, but the next view is {self.views}"
@@ -304,6 +302,30 @@ class Session:
         scene = self.scene.copy()
         with _collected_warnings() as warnings:
             graph_text(scene.update(view))  # reject a view whose graph cannot be written
+        self._add(view, event, content, scene)
+        self._warnings = warnings
+        return self._added()
+
+    def keep(self, view: View, scene: Scene) -> None:
+        """Add a view with which a copy of the scene was updated; once this returns, the view is on disk.
+
+        Raises:
+            InputError: The view cannot be kept; the session does not change.
+        """
+        self._check_writable()
+        self._check_alike(view)
+        graph_text(scene.graph)
+        self._add(view, *self._packed(view), scene)
+
+    def _packed(self, view: View) -> tuple[Event, bytes]:
+        """The line of the next view, and the content of its file."""
+        content = pack(replace(view, name=""))
+        name = view.name.encode(errors="replace").decode()  # that of a file may not be text
+        digest = hashlib.sha256(content).hexdigest()
+        return Event("view", name, self.views, digest, view.T_world_camera), content
+
+    def _add(self, view: View, event: Event, content: bytes, scene: Scene) -> None:
+        """Write the file of a view and its line, and continue with the scene after it."""
         path = self._file(event)
         with write_errors(self.path):
             path.parent.mkdir(exist_ok=True)
@@ -311,8 +333,6 @@ class Session:
         write_file(path, content, durable=True)
         self._keep(event, scene)
         self._first = self._first or view
-        self._warnings = warnings
-        return self._added()
 
     def take(self, object_id: str, T: ArrayLike | None = None, number: int | None = None) -> SupportGraph:
         """Report that the robot removed or moved an object; once this returns, the report is on disk.

@@ -7,11 +7,13 @@ small images, is enough. Without it, the first run compiles what it needs.
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from caryatid.config import Config, SensorConfig, VoxelConfig
 from caryatid.exploration import explore, next_best_view
+from caryatid.fitting.least_squares import levenberg_marquardt
 from caryatid.fitting.primitives import fit
 from caryatid.geometry.shapes import Box, Primitives
 from caryatid.geometry.solids import Solid
@@ -20,6 +22,11 @@ from caryatid.scene import Scene
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
+
+
+def is_warm() -> bool:
+    """Whether kernels were compiled before, if perhaps of an earlier version."""
+    return any(Path(levenberg_marquardt._cache.cache_path).glob("*.nbi"))
 
 
 def warm_up() -> None:

@@ -1,0 +1,292 @@
+"""One goal of the action `explore`: it waits for images and for the camera, in a thread of its own."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from functools import partial
+from threading import Lock
+from typing import Any
+
+import rclpy
+from action_msgs.msg import GoalInfo, GoalStatus, GoalStatusArray
+from caryatid_msgs.action import Explore
+from rclpy.duration import Duration
+from rclpy.qos import qos_profile_action_status_default
+from rclpy.time import Time
+from tf2_ros import TransformException
+
+from caryatid.errors import InputError
+from caryatid_ros.inbox import Inbox
+from caryatid_ros.parameters import read_parameters
+
+POLL = 0.05
+"""Time between two looks at images, transforms and cancellations [s]."""
+STILL = 0.2
+"""Time before a view in which the camera must not have moved [s]."""
+BEAT, SILENT = 0.5, 3.5
+"""Time between two signs of life that the client must acknowledge, and how long it may not do so [s]."""
+CANCELLED = "cancelled"
+"""Why a goal ended that its client cancelled."""
+
+
+class EndedError(Exception):
+    """The goal must end at once, for this reason."""
+
+
+class Goal:
+    """A goal that was accepted.
+
+    Args:
+        node: The node.
+        handle: Its handle, of the action server.
+
+    Attributes:
+        inbox: What arrives from the camera.
+        buffer: The transforms.
+    """
+
+    def __init__(self, node: Any, handle: Any, inbox: Inbox, buffer: Any) -> None:
+        self._node, self._handle, self.inbox, self.buffer = node, handle, inbox, buffer
+        self._settings = read_parameters(node)
+        self._views, self._lock = 0, Lock()
+        self._end, self._awaited, self._refusal = "", False, ""
+        self._watched, self._acknowledged, self._beat = False, time.monotonic(), 0.0
+        qos = qos_profile_action_status_default
+        self._status = node.create_publisher(GoalStatusArray, "explore/_action/status", qos)
+
+    def end(self, why: str) -> None:
+        """End the goal; once this returns, it publishes no further decision."""
+        with self._lock:
+            self._end = self._end or why
+
+    def refuse(self, reason: str) -> bool:
+        """Report that the camera cannot go to the next view; return whether one was awaited."""
+        if self._awaited:
+            self._refusal = reason or "the motion planner refuses it"
+        return self._awaited
+
+    def run(self) -> Any:
+        """Take views until no further view is worth its path, and return the result."""
+        log, finish = self._node.get_logger(), self._handle.abort
+        r = self._handle.request
+        log.info(f"goal: max_views {r.max_views}, goal '{r.goal}', until {r.until:g}, restart {r.restart}")
+        try:
+            why = self._explore()
+            finish = self._handle.succeed
+        except EndedError as error:
+            why = str(error)
+            if why == CANCELLED:
+                self._await_canceling()
+                finish = self._handle.canceled
+        except Exception as error:
+            why = self._node.sentence(error)
+        log.info(f"goal ended after {self._views} views: {why}")
+        self._node.tell_stage(f"idle; the last goal ended: {why}")
+        result = Explore.Result(message=why, views=self._views, graph=self._node.graph)
+        self._node.destroy_publisher(self._status)
+        self._node.goal = None  # before its client knows, who may send the next one
+        try:
+            finish()
+        except Exception as error:  # cancelled in this moment, or the node shuts down
+            self._node.sentence(error)
+        return result
+
+    def _await_canceling(self) -> None:
+        """Wait until the action server, which was told to accept the cancellation, has done so."""
+        for _ in range(200):
+            if self._handle.is_cancel_requested:
+                return
+            time.sleep(0.005)
+
+    def _explore(self) -> str:
+        """Take the views, and return why no further one is worth its path."""
+        node, settings, request = self._node, self._settings, self._handle.request
+        exploration = self._result("getting ready", node.prepared)
+        since = self._until(settings.image_timeout, partial(self._later, self._now()))
+        self._do("beginning", node.begin, request)
+        limit, stop = request.max_views or exploration.max_views, None
+        while stop is None:
+            self._stage(f"waiting for images of view {self._views + 1}")
+            view = self._until(settings.image_timeout, partial(self._image, since))
+            self._do(f"adding view {self._views + 1}", node.add_view, *view)
+            self._views += 1
+            stop = self._move() if self._views < limit else f"maximum of {self._views} views reached"
+            since = self._now()
+        if request.goal and all(o.id != request.goal for o in node.graph.objects):
+            stop = f"{stop}; {request.goal} was not found"
+        return stop
+
+    def _move(self) -> str | None:
+        """Have the camera moved to the next view, or to another if it is refused.
+
+        Returns:
+            Why there is no next view, or None on arrival.
+        """
+        refusal = ""
+        while True:
+            decision, stop = self._do("planning the next view", self._node.plan, refusal)
+            if stop is not None:
+                return stop
+            with self._lock:  # what ends the goal waits for this, or this is not published
+                self._check()
+                self._awaited, self._refusal = True, ""
+                self._node.publishers_of["decision"].publish(decision)
+                self._handle.publish_feedback(Explore.Feedback(views=self._views, decision=decision))
+            p = decision.camera.pose.position
+            where = f"({p.x:.3f}, {p.y:.3f}, {p.z:.3f}) m in {decision.camera.header.frame_id}"
+            self._node.get_logger().info(f"decision: next view at {where}: {decision.why}")
+            self._stage(f"waiting for the camera at {where}")
+            try:
+                refusal = self._until(self._settings.move_timeout, partial(self._arrived, decision))
+            finally:
+                self._awaited = False
+            if not refusal:
+                return None
+            self._node.get_logger().warning(f"the camera cannot go to this view: {refusal}")
+
+    def _arrived(self, decision: Any) -> str | InputError:
+        """Why the camera cannot go to the next view, an error while it is elsewhere, or '' on arrival."""
+        if self._refusal:
+            return self._refusal
+        s, pose = self._settings, decision.camera.pose
+        there = self._transform(self.frame, Time())
+        if isinstance(there, InputError):
+            return there
+        distance, angle = _between(there.translation, there.rotation, pose.position, pose.orientation)
+        if distance <= s.position_tolerance and angle <= s.angle_tolerance:
+            return ""
+        reason = (
+            f"is {1e3 * distance:.1f} mm and {angle:.4f} rad from the next view after {s.move_timeout:g} s; "
+            f"the tolerances are {1e3 * s.position_tolerance:g} mm and {s.angle_tolerance:g} rad"
+        )
+        remedy = "move it there, call the service refused, or raise move_timeout or the tolerances"
+        return InputError("camera", reason, remedy)
+
+    def _image(self, since: float) -> Any:
+        """The newest view that the camera took while it stood still, with its pose; or why there is none."""
+        first: InputError | None = None
+        try:
+            for depth, info, colour in self.inbox.views(since, self._settings.slop):
+                pose = self._still(depth.header)
+                if not isinstance(pose, InputError):
+                    self.frame = depth.header.frame_id
+                    return depth, info, colour, pose
+                first = first or pose
+        except InputError as error:
+            first = first or error
+        return first
+
+    def _still(self, header: Any) -> Any:
+        """The transform of a camera that stood still before an image, or an error."""
+        s, stamp = self._settings, Time.from_msg(header.stamp)
+        before = Time(nanoseconds=max(1, stamp.nanoseconds - int(1e9 * STILL)), clock_type=stamp.clock_type)
+        now, then = self._transform(header.frame_id, stamp), self._transform(header.frame_id, before)
+        for found in (now, then):
+            if isinstance(found, InputError):
+                return found
+        distance, angle = _between(now.translation, now.rotation, then.translation, then.rotation)
+        speed, turn = distance / STILL, angle / STILL
+        if speed <= s.max_speed and turn <= s.max_turn:
+            return now
+        reason = f"moves while images arrive, by {1e3 * speed:.0f} mm/s and {turn:.3f} rad/s"
+        return InputError("camera", reason, "hold it still, or raise max_speed and max_turn")
+
+    def _transform(self, frame: str, when: Any) -> Any:
+        """The geometry_msgs/Transform world ← frame, or an error."""
+        world = self._settings.world_frame
+        try:
+            found = self.buffer.lookup_transform(world, frame, when, Duration()).transform
+            q = found.rotation
+            if math.hypot(q.x, q.y, q.z, q.w) > 1e-6:
+                return found
+            error = "its quaternion is zero or NaN"
+        except TransformException as raised:
+            error = str(raised)
+        at = f" at {1e-9 * when.nanoseconds:.3f} s" if when.nanoseconds else ""
+        reason, remedy = f"is unknown{at} ({error})", "publish it in tf, or set world_frame"
+        return InputError(f"transform {world} ← {frame}", reason, remedy)
+
+    def _later(self, start: float) -> float | InputError:
+        """The ROS time [s] once it has moved on."""
+        return self._now() if self._now() > start else InputError("ROS time", "has not moved on")
+
+    def _now(self) -> float:
+        return float(1e-9 * self._node.get_clock().now().nanoseconds)
+
+    def _stage(self, text: str) -> None:
+        self._node.tell_stage(text)
+
+    def _do(self, stage: str, work: Callable[..., Any], *given: Any) -> Any:
+        """Result of work that the node's thread for the scene does."""
+        return self._result(stage, self._node.scene_thread.submit(work, *given))
+
+    def _result(self, stage: str, job: Future[Any]) -> Any:
+        self._stage(stage)
+        try:
+            while not wait([job], timeout=POLL).done:
+                self._check()
+            self._check()
+        except EndedError:
+            job.cancel()
+            raise
+        return job.result()
+
+    def _until(self, seconds: float, ready: Callable[[], Any]) -> Any:
+        """Wait for a result other than an error, until a time [s] is over.
+
+        The ROS clock measures it, or a steady clock while that stands still.
+        """
+        waited, before, moved = 0.0, self._now(), time.monotonic()
+        while True:
+            self._check()
+            found, now = ready(), self._now()
+            if not isinstance(found, InputError):
+                return found
+            if now != before:
+                waited, before, moved = waited + max(now - before, 0.0), now, time.monotonic()
+            if time.monotonic() - moved > seconds:
+                reason, remedy = (
+                    f"stands still at {now:.3f} s",
+                    "publish /clock, or set use_sim_time to false",
+                )
+                raise InputError("ROS time", reason, remedy)
+            if waited > seconds:
+                raise found
+            time.sleep(POLL)
+
+    def _check(self) -> None:
+        """Raise EndedError if the goal must end: it was cancelled, its client is gone, or the node stops."""
+        self._end = self._end or (CANCELLED if self._handle.is_cancel_requested else "")
+        self._end = self._end or ("" if rclpy.ok() else "the node was stopped")
+        self._end = self._end or ("" if self._is_client_there() else "the client of the goal is gone")
+        if self._end:
+            raise EndedError(self._end)
+
+    def _is_client_there(self) -> bool:
+        """Whether the client receives messages of the goal's status, which are repeated for this purpose.
+
+        DDS notices only after 20 s that a process was killed.
+        """
+        now, node = time.monotonic(), self._node
+        if now - self._beat < BEAT:
+            return True
+        self._beat = now
+        before, self._watched = self._watched, node.count_subscribers("explore/_action/feedback") > 0
+        if before and not self._watched:
+            return False
+        if self._status.wait_for_all_acked(Duration(seconds=0.01)):
+            self._acknowledged = now
+            info = GoalInfo(goal_id=self._handle.goal_id)
+            status = GoalStatus(goal_info=info, status=self._handle.status)
+            self._status.publish(GoalStatusArray(status_list=[status]))
+        return now - self._acknowledged < SILENT
+
+
+def _between(p: Any, q: Any, p2: Any, q2: Any) -> tuple[float, float]:
+    """Distance [m] of two positions, and angle [rad] of two quaternions."""
+    dot = abs(q.x * q2.x + q.y * q2.y + q.z * q2.z + q.w * q2.w)
+    size = math.hypot(q.x, q.y, q.z, q.w) * math.hypot(q2.x, q2.y, q2.z, q2.w)
+    return math.dist((p.x, p.y, p.z), (p2.x, p2.y, p2.z)), 2.0 * math.acos(min(1.0, dot / size))

@@ -1,0 +1,259 @@
+"""The node `caryatid`: its topics, its action and services, and the threads that work for them."""
+
+from __future__ import annotations
+
+import logging
+import traceback
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from threading import Thread
+from typing import Any
+
+import rclpy
+from caryatid_msgs.action import Explore
+from caryatid_msgs.msg import Decision, SupportGraph
+from caryatid_msgs.srv import Order, Refused, Removed
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.task import Future
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header, String
+from tf2_ros import Buffer, TransformListener
+from visualization_msgs.msg import MarkerArray
+
+from caryatid.errors import CaryatidError, InputError, in_one_line
+from caryatid_ros.goal import CANCELLED, Goal
+from caryatid_ros.inbox import Inbox
+from caryatid_ros.parameters import declare_parameters, read_parameters
+
+PUBLISHED = {"support_graph": SupportGraph, "markers": MarkerArray, "stage": String, "decision": Decision}
+"""Topics, relative to the node's namespace, and their types."""
+
+
+class ExplorationNode(Node):
+    """Takes views, and offers the action `explore` and the services `order`, `removed` and `refused`.
+
+    The thread that spins only receives, answers and publishes. A goal waits in a thread of its own; one more
+    changes the scene, and one plans removal orders, so that a cancellation is answered at once.
+
+    Attributes:
+        prepared: Future of the Exploration, which is made in the scene's thread.
+        failure: Why that failed, in one sentence; the node then stops.
+        graph: The newest graph as a message.
+        goal: The goal that runs, or None.
+
+    Raises:
+        InputError: A parameter cannot be used.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("caryatid")
+        declare_parameters(self)
+        self.settings = read_parameters(self)
+        self.failure, self.graph = "", SupportGraph()
+        self.goal: Goal | None = None
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        # A client that comes late must not drive to the view of an old goal.
+        qos = dict.fromkeys(PUBLISHED, latched) | {"decision": QoSProfile(depth=1)}
+        self.publishers_of = {n: self.create_publisher(kind, n, qos[n]) for n, kind in PUBLISHED.items()}
+        for name in ("caryatid", "caryatid_ros"):
+            logging.getLogger(name).setLevel(logging.INFO)
+            logging.getLogger(name).addHandler(_ToRosout(self.get_logger()))
+        self.scene_thread, self._order_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+        self.tell_stage("starting")
+        self.prepared = self.scene_thread.submit(self._prepare)
+        # Some drivers publish it only once, for those who come late; others never do so for them.
+        self._info: Any = None
+        for profile in (qos_profile_sensor_data, latched):
+            self.create_subscription(
+                CameraInfo, self.settings.info_topic, self._take_info, profile,
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            )  # fmt: skip
+        group = ReentrantCallbackGroup()
+        self.create_service(Order, "order", self._order, callback_group=group)
+        self.create_service(Removed, "removed", self._removed, callback_group=group)
+        self.create_service(Refused, "refused", self._refused, callback_group=group)
+        self._server = ActionServer(
+            self, Explore, "explore", self._execute, callback_group=group,
+            goal_callback=self._admit, handle_accepted_callback=self._begin, cancel_callback=self._cancel,
+        )  # fmt: skip
+
+    def tell_stage(self, text: str) -> None:
+        """Publish what the node does now."""
+        self.publishers_of["stage"].publish(String(data=text))
+
+    def sentence(self, error: Exception) -> str:
+        """Describe an error in a sentence; the log has the traceback of one that nobody expected."""
+        if isinstance(error, InputError) and "--" in error.remedy:  # that is for the command line
+            remedy = "check world_frame (level, z up) and the images' frame (x right, y down, z forward)"
+            error = InputError(error.source, error.reason, remedy)
+        if isinstance(error, (CaryatidError, OSError, MemoryError)):
+            return in_one_line(error)
+        self.get_logger().error("".join(traceback.format_exception(error)))
+        return f"internal error: {type(error).__name__}: {error}; the node's log has the traceback"
+
+    # In the scene's thread
+
+    def _prepare(self) -> Any:
+        """Import what takes long, read the settings, open the session, and compile the kernels."""
+        try:
+            from caryatid.simulation.warm_up import is_warm, warm_up
+            from caryatid_ros import messages
+            from caryatid_ros.exploration import Exploration
+
+            self._messages, self._make = messages, messages.make_message
+            exploration = Exploration(self.settings)
+            if not is_warm():
+                self.get_logger().info("compiling kernels, once after installation, for about a minute")
+                self.tell_stage("compiling kernels")
+                warm_up()
+        except Exception as error:
+            self.failure = self.sentence(error)
+            rclpy.try_shutdown()
+            raise
+        self._exploration, self._header = exploration, Header(frame_id=self.settings.world_frame)
+        if exploration.scene.views:
+            self._header.stamp = self.get_clock().now().to_msg()
+            self._publish_scene()
+        self.get_logger().info(f"ready: {self.settings}")
+        self.tell_stage("idle")
+        return exploration
+
+    def begin(self, request: Any) -> None:
+        """Begin a goal."""
+        self._exploration.begin(request.goal, request.until, request.restart)
+        self.graph = SupportGraph() if request.restart else self.graph
+
+    def add_view(self, depth: Any, info: Any, colour: Any, pose: Any) -> None:
+        """Add a view with the geometry_msgs/Transform of its camera, and publish the graph."""
+        T_world_camera = self._messages.matrix_of(pose.rotation, pose.translation, "camera")
+        rectified = self.settings.rectified or "rect" in self.settings.depth_topic.rpartition("/")[2]
+        view = self._messages.view_of(depth, info, colour, T_world_camera, rectified=rectified)
+        self._exploration.look(view)
+        self._header.stamp = depth.header.stamp
+        self._publish_scene()
+        self.get_logger().info(f"view {view.name} added: {self._exploration.scene}")
+
+    def plan(self, refusal: str) -> tuple[Any, str | None]:
+        """Plan the next view, or another one if that was refused: its Decision, or why there is none."""
+        step = self._exploration.put_aside(refusal) if refusal else self._exploration.plan()
+        if step.stop is not None or step.decision is None:
+            return None, step.stop
+        return self._messages.decision_message(self._make, step.decision, self._header), None
+
+    def _publish_scene(self) -> None:
+        scene = self._exploration.scene
+        self.graph = self._messages.graph_message(self._make, scene.graph, scene.new_changes, self._header)
+        self.publishers_of["support_graph"].publish(self.graph)
+        markers = self._messages.markers_message(self._make, scene.graph, self._header)
+        self.publishers_of["markers"].publish(markers)
+
+    def _report(self, request: Any, response: Any) -> None:
+        self.prepared.result()
+        motion, T = request.motion, None
+        if request.moved:
+            T = self._messages.matrix_of(motion.rotation, motion.translation, "motion")
+        self._exploration.removed(request.object, T)
+        self._publish_scene()
+        response.graph = self.graph
+
+    # In the thread of orders
+
+    def _plan_order(self, request: Any, response: Any) -> None:
+        found = self.prepared.result().order(request.goal, request.hands, request.steps)
+        response.lifts = self._messages.lift_messages(self._make, found)
+        response.safe, response.message = found.safe, found.refusal
+
+    # In the thread that spins
+
+    async def _order(self, request: Any, response: Any) -> Any:
+        return await self._answer(self._order_thread, self._plan_order, request, response)
+
+    async def _removed(self, request: Any, response: Any) -> Any:
+        return await self._answer(self.scene_thread, self._report, request, response)
+
+    def _refused(self, request: Any, response: Any) -> Any:
+        response.success = self.goal is not None and self.goal.refuse(request.reason)
+        response.message = "" if response.success else "no next view is awaited"
+        return response
+
+    async def _answer(
+        self, thread: ThreadPoolExecutor, work: Callable[[Any, Any], None], request: Any, response: Any
+    ) -> Any:
+        """Have a thread fill in a response; any error becomes a sentence in it."""
+
+        def fill_in() -> None:
+            try:
+                work(request, response)
+                response.success = True
+            except Exception as error:
+                response.success, response.message = False, self.sentence(error)
+            done.set_result(response)
+
+        done = self._future()
+        thread.submit(fill_in)
+        return await done
+
+    def _future(self) -> Future:
+        """A future that wakes the thread that spins when it is done."""
+        done = Future()
+        done.add_done_callback(lambda _: self.executor.wake())
+        return done
+
+    def _take_info(self, message: Any) -> None:
+        self._info = message
+        if self.goal is not None:
+            self.goal.inbox.put("info", message)
+
+    def _admit(self, request: Any) -> GoalResponse:
+        if self.goal is None:
+            return GoalResponse.ACCEPT
+        self.get_logger().warning("a goal is rejected, because another one is running; cancel that first")
+        return GoalResponse.REJECT
+
+    def _begin(self, handle: Any) -> None:
+        """Listen to the camera for the new goal only, because images and transforms cost time."""
+        before, settings, buffer = set(self.subscriptions), self.settings, Buffer()
+        self._listener = TransformListener(buffer, self)
+        given = {"depth": settings.depth_topic, "info": settings.info_topic, "colour": settings.colour_topic}
+        topics = {what: self.resolve_topic_name(topic) for what, topic in given.items() if topic}
+        inbox = Inbox(topics, self._info)
+        for what in topics.keys() - {"info"}:
+            packed = topics[what].endswith(("/compressed", "/compressedDepth"))
+            kind, put = CompressedImage if packed else Image, partial(inbox.put, what)
+            self.create_subscription(kind, given[what], put, qos_profile_sensor_data)
+        self.goal = Goal(self, handle, inbox, buffer)
+        self._heard = set(self.subscriptions) - before
+        handle.execute()
+
+    async def _execute(self, handle: Any) -> Any:
+        done, goal, heard = self._future(), self.goal, self._heard
+        assert goal is not None
+        Thread(target=lambda: done.set_result(goal.run()), daemon=True).start()
+        await done
+        for subscription in heard:
+            self.destroy_subscription(subscription)
+        return done.result()
+
+    def _cancel(self, handle: Any) -> CancelResponse:
+        if self.goal is not None:
+            self.goal.end(CANCELLED)
+        return CancelResponse.ACCEPT
+
+
+class _ToRosout(logging.Handler):
+    """Hands on what caryatid logs."""
+
+    def __init__(self, log: Any) -> None:
+        super().__init__(logging.INFO)
+        self._log = log
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno >= logging.WARNING:
+            self._log.warning(record.getMessage())
+        else:
+            self._log.info(record.getMessage())
