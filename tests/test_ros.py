@@ -274,7 +274,7 @@ def test_the_packages_name_what_they_need():
     declared = {
         n.target.id: n.value.args[0].value
         for n in ast.walk(tree)
-        if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)
+        if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name) and isinstance(n.value, ast.Call)
     }
     assert {name: yaml.safe_load(text) for name, text in listed_params.items()} == declared
     fields = [line for p in INTERFACES for line in p.read_text().splitlines() if line and line[0] not in "#-"]

@@ -16,6 +16,7 @@ from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
 from table import DEFAULTS
 
 SERVICES = {"order": Order, "refused": Refused, "removed": Removed}
@@ -57,7 +58,7 @@ class Client(Node):
     """Clients of all that the node offers; a context manager that spins meanwhile.
 
     Attributes:
-        graphs, decisions, logs: What was published so far.
+        graphs, decisions, logs, stages: What was published so far.
     """
 
     def __init__(self) -> None:
@@ -66,9 +67,11 @@ class Client(Node):
         self.graphs: list[SupportGraph] = []
         self.decisions: list[Decision] = []
         self.logs: list[Log] = []
+        self.stages: list[str] = []
         self.create_subscription(SupportGraph, "/support_graph", self.graphs.append, latched)
         self.create_subscription(Decision, "/decision", self.decisions.append, 10)
         self.create_subscription(Log, "/rosout", self.logs.append, 100)
+        self.create_subscription(String, "/stage", lambda m: self.stages.append(m.data), latched)
         self._explore = ActionClient(self, Explore, "/explore")
         self._clients_of = {name: self.create_client(kind, f"/{name}") for name, kind in SERVICES.items()}
         self._settings_of_table = self.create_client(SetParameters, "/table/set_parameters")

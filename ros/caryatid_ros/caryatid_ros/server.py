@@ -16,7 +16,6 @@ from caryatid_msgs.msg import Decision, SupportGraph
 from caryatid_msgs.srv import Order, Refused, Removed
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.task import Future
@@ -32,6 +31,8 @@ from caryatid_ros.parameters import declare_parameters, read_parameters
 
 PUBLISHED = {"support_graph": SupportGraph, "markers": MarkerArray, "stage": String, "decision": Decision}
 """Topics, relative to the node's namespace, and their types."""
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""How topics are published whose newest message those receive, too, who come late."""
 
 
 class ExplorationNode(Node):
@@ -56,9 +57,8 @@ class ExplorationNode(Node):
         self.settings = read_parameters(self)
         self.failure, self.graph = "", SupportGraph()
         self.goal: Goal | None = None
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         # A client that comes late must not drive to the view of an old goal.
-        qos = dict.fromkeys(PUBLISHED, latched) | {"decision": QoSProfile(depth=1)}
+        qos = dict.fromkeys(PUBLISHED, LATCHED) | {"decision": QoSProfile(depth=1)}
         self.publishers_of = {n: self.create_publisher(kind, n, qos[n]) for n, kind in PUBLISHED.items()}
         for name in ("caryatid", "caryatid_ros"):
             logging.getLogger(name).setLevel(logging.INFO)
@@ -66,13 +66,10 @@ class ExplorationNode(Node):
         self.scene_thread, self._order_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self.tell_stage("starting")
         self.prepared = self.scene_thread.submit(self._prepare)
-        # Some drivers publish it only once, for those who come late; others never do so for them.
         self._info: Any = None
-        for profile in (qos_profile_sensor_data, latched):
-            self.create_subscription(
-                CameraInfo, self.settings.info_topic, self._take_info, profile,
-                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            )  # fmt: skip
+        self.create_subscription(
+            CameraInfo, self.settings.info_topic, self._take_info, qos_profile_sensor_data
+        )
         group = ReentrantCallbackGroup()
         self.create_service(Order, "order", self._order, callback_group=group)
         self.create_service(Removed, "removed", self._removed, callback_group=group)
@@ -226,6 +223,9 @@ class ExplorationNode(Node):
             packed = topics[what].endswith(("/compressed", "/compressedDepth"))
             kind, put = CompressedImage if packed else Image, partial(inbox.put, what)
             self.create_subscription(kind, given[what], put, qos_profile_sensor_data)
+        for publisher in self.get_publishers_info_by_topic(topics["info"]):
+            if publisher.qos_profile.durability == LATCHED.durability:  # it may have published before we came
+                self.create_subscription(CameraInfo, given["info"], self._take_info, LATCHED)
         self.goal = Goal(self, handle, inbox, buffer)
         self._heard = set(self.subscriptions) - before
         handle.execute()
