@@ -17,7 +17,7 @@ collect_ignore = ["stand_ins", "table.py"]
 try:
     import rclpy
 except ImportError:
-    collect_ignore += ["test_node.py"]
+    collect_ignore += ["test_node.py", "test_starting.py"]
 
 HERE = Path(__file__).parent
 NODE = "-c", "from caryatid_ros.node import main; main()"
@@ -81,6 +81,20 @@ def wait_for(condition, seconds: float = 10.0, what: str = "it"):
     return found
 
 
+def within(seconds, call):
+    """Return the result of a call that must return within a time [s]."""
+    since = time.monotonic()
+    found = call()
+    assert (took := time.monotonic() - since) <= seconds, f"took {took:.2f} s"
+    return found
+
+
+def at_stage(client, text, seconds: float = 30.0):
+    """Wait until the node tells a stage that it has not told before."""
+    known = len(client.stages)
+    wait_for(lambda: any(text in stage for stage in client.stages[known:]), seconds, text)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def domain():
     """A ROS domain of its own on this machine, and this process as a client in it."""
@@ -133,6 +147,12 @@ def client():
 
     with Client() as found:
         yield found
+
+
+@pytest.fixture(autouse=True)
+def defaults(client, table):
+    """The table as it is by default."""
+    client.set_table()
 
 
 @pytest.hookimpl(wrapper=True)

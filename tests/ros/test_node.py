@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
+import signal
 import time
 
 import pytest
 from action_msgs.msg import GoalStatus
-from conftest import wait_for
+from conftest import HERE, Process, at_stage, wait_for, within
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.parameter import Parameter
 
 pytestmark = pytest.mark.usefixtures("table", "node")
 SUCCEEDED, CANCELED, ABORTED = (
     getattr(GoalStatus, f"STATUS_{name}") for name in ("SUCCEEDED", "CANCELED", "ABORTED")
 )
 ALL = ["depth", "colour", "info", "tf"]
-
-
-@pytest.fixture(autouse=True)
-def defaults(client):
-    client.set_table()
-
-
-def within(seconds, call):
-    """Result of a call that must return within a time [s]."""
-    since = time.monotonic()
-    found = call()
-    assert (took := time.monotonic() - since) <= seconds, f"took {took:.2f} s"
-    return found
-
-
-def at_stage(client, text):
-    """Wait until the node tells a stage that it has not told before."""
-    known = len(client.stages)
-    wait_for(lambda: any(text in stage for stage in client.stages[known:]), 30.0, text)
+OTHER = (
+    f"import sys, time; sys.path.insert(0, '{HERE}'); import rclpy; from client import Client; rclpy.init()\n"
+)
+LATE = OTHER + "with Client() as c: time.sleep(1.5); print(len(c.decisions), len(c.graphs))"
+DYING = OTHER + "with Client() as c: c.explore(max_views=9, restart=True); print('sent'); time.sleep(60)"
 
 
 def test_a_goal_takes_views_and_ends_with_a_graph(client):
@@ -62,7 +51,7 @@ def test_cancel_is_answered_while_orders_are_planned(client):
     client.set_table(follow=False)
     goal = client.explore(max_views=9, restart=True)
     at_stage(client, "planning")
-    answers = [client.start_call("order", hands=2) for _ in range(5)]
+    answers = [client.start_call("order", steps=2) for _ in range(4)]
     at_stage(client, "waiting for the camera")
     for _ in range(3):
         assert within(0.3, lambda: client.call("refused", reason="").success)
@@ -117,3 +106,62 @@ def test_a_second_goal_is_rejected_and_hands_are_checked(client):
     status, result = goal.result(10.0)
     assert status == ABORTED
     assert "mm and " in result.message
+
+
+def test_a_late_client_gets_no_old_decision_but_the_graph(client):
+    goal = client.explore(max_views=2, restart=True)
+    goal.result()
+    late = Process("-c", LATE)
+    assert late.process.wait(20.0) == 0
+    wait_for(lambda: late.lines)
+    assert late.text == "0 1\n"
+
+
+def test_a_view_is_taken_only_after_the_camera_has_come_to_rest(client):
+    client.set_table(motion_time=2.0)
+    goal = client.explore(max_views=2, restart=True)
+    wait_for(lambda: goal.feedback, 30.0)
+    since = time.time()
+    status, result = goal.result()
+    stamp = result.graph.header.stamp
+    assert status == SUCCEEDED
+    assert stamp.sec + 1e-9 * stamp.nanosec > since + 1.9
+
+
+def test_camera_info_holds_until_the_next_one(client):
+    client.set_table(topics=["depth", "colour", "tf"])
+    assert client.explore(max_views=1, restart=True).result()[0] == SUCCEEDED
+
+
+def test_parameters_are_described_and_read_only_where_they_do_not_change(client):
+    def ask(kind, name, request):
+        service = client.create_client(kind, f"/caryatid/{name}")
+        assert service.wait_for_service(10.0)
+        return wait_for((answer := service.call_async(request)).done) and answer.result()
+
+    names = ["move_timeout", "seed", "depth_topic"]
+    told = ask(DescribeParameters, "describe_parameters", DescribeParameters.Request(names=names)).descriptors
+    assert all(d.description for d in told)
+    assert [d.read_only for d in told] == [False, True, True]
+    assert told[0].floating_point_range[0].from_value == 0.1
+    values = {"move_timeout": [7, -1.0, "long", float("nan")], "depth_topic": ["/other"], "seed": [1]}
+    request = SetParameters.Request()
+    for name, given in values.items():
+        request.parameters += [Parameter(name, value=value).to_parameter_msg() for value in given]
+    results = ask(SetParameters, "set_parameters", request).results
+    assert [r.successful for r in results] == [True] + [False] * 5
+    assert results[3].reason == "move_timeout is nan; give a number from 0.1 to 1e+06"
+    request.parameters = [Parameter("move_timeout", value=5.0).to_parameter_msg()]
+    ask(SetParameters, "set_parameters", request)
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+def test_a_goal_ends_when_its_client_dies(client, how):
+    client.set_table(follow=False)
+    dying = Process("-c", DYING)
+    wait_for(lambda: "sent" in dying.text, 20.0)
+    wait_for(lambda: "waiting for the camera" in client.stages[-1], 20.0)
+    dying.stop(how)
+    within(5.0, lambda: wait_for(lambda: "the client of the goal is gone" in client.stages[-1]))
+    client.set_table()
+    assert client.explore(max_views=1).result()[0] == SUCCEEDED

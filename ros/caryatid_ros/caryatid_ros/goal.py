@@ -83,14 +83,14 @@ class Goal:
                 finish = self._handle.canceled
         except Exception as error:
             why = self._node.sentence(error)
-        log.info(f"goal ended after {self._views} views: {why}")
-        self._node.tell_stage(f"idle; the last goal ended: {why}")
         result = Explore.Result(message=why, views=self._views, graph=self._node.graph)
-        self._node.destroy_publisher(self._status)
-        self._node.goal = None  # before its client knows, who may send the next one
         try:
+            log.info(f"goal ended after {self._views} views: {why}")
+            self._stage(f"idle; the last goal ended: {why}")
+            self._node.destroy_publisher(self._status)
+            self._node.goal = None  # before its client knows, who may send the next one
             finish()
-        except Exception as error:  # cancelled in this moment, or the node shuts down
+        except Exception as error:  # cancelled at this moment, or the node stops
             self._node.sentence(error)
         return result
 

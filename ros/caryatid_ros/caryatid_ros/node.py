@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import traceback
 
 
 def main() -> None:
@@ -28,8 +27,8 @@ def main() -> None:
                     executor.spin()
                 except ExternalShutdownException:
                     break
-                except Exception:
-                    node.get_logger().error(f"a callback failed: {traceback.format_exc()}")
+                except Exception as error:
+                    node.sentence(error)  # which logs it
         except CaryatidError as error:
             status = _refuse(in_one_line(error))
         if node is not None and node.failure:
@@ -38,7 +37,7 @@ def main() -> None:
         pass
     if node is not None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        node.destroy_node()  # others then know at once that it is gone
+        node.destroy_node()
     # Threads that compile or compute would go on for seconds; what is acknowledged is on disk.
     sys.stderr.flush()
     os._exit(status)

@@ -79,6 +79,11 @@ class ExplorationNode(Node):
             goal_callback=self._admit, handle_accepted_callback=self._begin, cancel_callback=self._cancel,
         )  # fmt: skip
 
+    def destroy_node(self) -> None:
+        """Destroy the node and all that it offers, so that others know at once that it is gone."""
+        self._server.destroy()
+        super().destroy_node()
+
     def tell_stage(self, text: str) -> None:
         """Publish what the node does now."""
         self.publishers_of["stage"].publish(String(data=text))
@@ -90,6 +95,8 @@ class ExplorationNode(Node):
             error = InputError(error.source, error.reason, remedy)
         if isinstance(error, (CaryatidError, OSError, MemoryError)):
             return in_one_line(error)
+        if not rclpy.ok():
+            return "the node was stopped"
         self.get_logger().error("".join(traceback.format_exception(error)))
         return f"internal error: {type(error).__name__}: {error}; the node's log has the traceback"
 

@@ -1,0 +1,90 @@
+"""What the node does while it starts and stops, on real ROS 2; each test starts its own."""
+
+from __future__ import annotations
+
+import re
+import signal
+import time
+
+import pytest
+from action_msgs.msg import GoalStatus
+from conftest import HERE, NODE, Process, wait_for, within
+
+ABORTED, CANCELED, SUCCEEDED = (
+    getattr(GoalStatus, f"STATUS_{name}") for name in ("ABORTED", "CANCELED", "SUCCEEDED")
+)
+PARAMS = HERE.parents[1] / "ros/caryatid_ros/launch/params.yaml"
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"image_timeout": "soon"}, "error: parameter image_timeout: .*give a number from 0.1"),
+        ({"seed": -1}, "error: parameter seed: .*out of range"),
+        ({"seed": 0.5}, "error: parameter seed: .*type"),
+        ({"planner": "best"}, "error: .*best"),
+    ],
+)
+def test_a_wrong_parameter_is_one_sentence(start_node, given, said):
+    node = start_node(**given)
+    assert node.process.wait(20.0) == 1
+    wait_for(lambda: "error: " in node.text)
+    assert re.search(said, node.text)
+    assert "Traceback" not in node.text
+
+
+def test_a_parameter_file_holds_for_any_name_and_misspelt_names_are_told(tmp_path):
+    file = tmp_path / "params.yaml"
+    file.write_text(
+        PARAMS.read_text().replace("move_timeout: 120.0", "move_timeout: 61\n    move_timout: 60.0")
+    )
+    node = Process(*NODE, "--ros-args", "-r", "__ns:=/lab", "-r", "__node:=eyes", "--params-file", file)
+    wait_for(lambda: "move_timeout=61.0" in node.text, 30.0)
+    assert "unknown parameter 'move_timout' is ignored; did you mean move_timeout?" in node.text
+    node.stop()
+
+
+def test_without_a_clock_a_goal_says_that_time_stands_still(start_node, client):
+    start_node(use_sim_time=True, image_timeout=1.0)
+    status, result = client.explore(max_views=1).result(20.0)
+    assert (status, result.message.partition(";")[0]) == (ABORTED, "ROS time: stands still at 0.000 s")
+
+
+def test_while_kernels_compile_cancel_and_ctrl_c_are_obeyed(start_node, client, tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    node = start_node()
+    goal = client.explore(max_views=1)
+    wait_for(lambda: "compiling kernels" in node.text, 30.0)
+    time.sleep(2.0)
+    assert within(0.3, goal.cancel)
+    assert goal.result(1.0)[0] == CANCELED
+    assert not client.explore(max_views=1).done
+    time.sleep(0.5)
+    status, took = node.stop()
+    assert took <= 1.0
+    assert status == 0
+    assert "Traceback" not in node.text
+
+
+@pytest.mark.parametrize("wait", [0.1, 0.4, 0.8, 1.6])
+def test_ctrl_c_while_starting_is_quiet(start_node, wait):
+    node = start_node()
+    time.sleep(wait)
+    assert node.stop()[1] <= 1.0
+    assert "caryatid" not in node.text.partition("Traceback")[2]
+
+
+def test_a_session_outlives_a_kill(start_node, client, tmp_path):
+    session = str(tmp_path / "scene")
+    node = start_node(session=session)
+    client.explore(max_views=2).result()
+    told = client.call("removed", object="o5")
+    assert told.success
+    node.stop(signal.SIGKILL)
+    known = len(client.graphs)
+    start_node(session=session)
+    wait_for(lambda: len(client.graphs) > known, 30.0)
+    assert {o.id for o in client.graphs[-1].objects} == {o.id for o in told.graph.objects}
+    assert client.call("order", steps=1).success
+    status, result = client.explore(max_views=1).result()
+    assert (status, result.views) == (SUCCEEDED, 1)
