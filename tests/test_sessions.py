@@ -17,14 +17,17 @@ from filelock import FileLock
 
 from caryatid.config import Config
 from caryatid.errors import CaryatidError, InputError, PlanningError
+from caryatid.exploration import Explorer
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.io.images import png
 from caryatid.io.staging import BusyError
+from caryatid.robots import HUMANOID, find_robot
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
 from caryatid.sessions import Capture, Session
 from caryatid.sessions import session as session_module
+from caryatid.sessions.carried_camera import CarriedCamera
 from caryatid.sessions.messages import CameraRecord
 from caryatid.sessions.session import SessionConflictError, _Unpickler
 
@@ -83,6 +86,22 @@ def test_a_session_keeps_its_options(folder, views):
         session.add(views[0], number=-1)
     beginning = session.beginning
     assert (beginning.settings, beginning.planner, beginning.seed) == (config, "random", 3)
+
+
+def test_a_session_keeps_a_view_with_which_an_explorer_updated_a_copy(begun, graph_after, views):
+    robot = CarriedCamera(find_robot(HUMANOID))
+    explorer = Explorer(robot=robot, segmentation="labels", seed=7)
+    with Session.open(begun) as session:
+        explorer.scene = robot.scene = session.scene.copy()
+        robot.T_world_camera = views[2].pose
+        explorer.look(views[2])
+        assert session.views == 2
+        with pytest.raises(InputError, match="its camera has"):
+            session.keep(replace(views[2], K=2.0 * views[2].K), explorer.scene)
+        session.keep(views[2], explorer.scene)
+        assert explorer.plan().candidates is not None
+    with Session.open(begun, read_only=True) as session:
+        assert (session.views, graph_text(session.graph)) == (3, graph_after(0, 1, 2))
 
 
 def test_the_next_view_is_where_the_robot_can_be(begun):

@@ -48,7 +48,8 @@ def main(folder: Path = ROOT / ".ros") -> None:
     python = folder / "bin/python"
     _run(sys.executable, "-m", "venv", "--clear", folder)
     wheels = [f"ros-jazzy-{name}" for name in (*RUN, *BUILD)]
-    _run(python, "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", *wheels, "catkin_pkg", "numpy")
+    others = "catkin_pkg", "numpy", "py-trees"
+    _run(python, "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", *wheels, *others)
     site = Path(sysconfig.get_path("purelib", vars={"base": str(folder)}))
     # The wheels name the include folders of the machine that built them.
     version = f"{sys.version_info.major}{sys.version_info.minor}"

@@ -59,6 +59,7 @@ class Client(Node):
 
     Attributes:
         graphs, decisions, logs, stages: What was published so far.
+        action, service_clients: The clients of rclpy.
     """
 
     def __init__(self) -> None:
@@ -72,8 +73,8 @@ class Client(Node):
         self.create_subscription(Decision, "/decision", self.decisions.append, 10)
         self.create_subscription(Log, "/rosout", self.logs.append, 100)
         self.create_subscription(String, "/stage", lambda m: self.stages.append(m.data), latched)
-        self._explore = ActionClient(self, Explore, "/explore")
-        self._clients_of = {name: self.create_client(kind, f"/{name}") for name, kind in SERVICES.items()}
+        self.action = ActionClient(self, Explore, "/explore")
+        self.service_clients = {name: self.create_client(kind, f"/{name}") for name, kind in SERVICES.items()}
         self._settings_of_table = self.create_client(SetParameters, "/table/set_parameters")
 
     def __enter__(self) -> Client:
@@ -90,8 +91,8 @@ class Client(Node):
 
     def explore(self, **fields: Any) -> Goal:
         """Send a goal."""
-        assert self._explore.wait_for_server(20.0), "there is no action server"
-        return Goal(self._explore, Explore.Goal(**fields))
+        assert self.action.wait_for_server(20.0), "there is no action server"
+        return Goal(self.action, Explore.Goal(**fields))
 
     def call(self, name: str, seconds: float = 30.0, **fields: Any) -> Any:
         """Call a service, and return its response."""
@@ -99,8 +100,8 @@ class Client(Node):
 
     def start_call(self, name: str, **fields: Any) -> Any:
         """Call a service, and return the future."""
-        assert self._clients_of[name].wait_for_service(20.0), f"there is no service {name}"
-        return self._clients_of[name].call_async(SERVICES[name].Request(**fields))
+        assert self.service_clients[name].wait_for_service(20.0), f"there is no service {name}"
+        return self.service_clients[name].call_async(SERVICES[name].Request(**fields))
 
     def set_table(self, **parameters: Any) -> None:
         """Change parameters of the table; those that are not given get their defaults."""

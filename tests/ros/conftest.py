@@ -135,7 +135,7 @@ def start_node():
 @pytest.fixture(scope="module")
 def node(table):
     """A node with default parameters, which the tests of a module share."""
-    process = Process(*NODE, **TOPICS, image_timeout=3.0, move_timeout=5.0)
+    process = Process(*NODE, **TOPICS, image_timeout=2.0, move_timeout=5.0, robot="breaking:make")
     yield process
     process.stop()
 

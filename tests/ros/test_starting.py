@@ -8,7 +8,7 @@ import time
 
 import pytest
 from action_msgs.msg import GoalStatus
-from conftest import HERE, NODE, Process, wait_for, within
+from conftest import HERE, NODE, Process, at_stage, wait_for, within
 
 ABORTED, CANCELED, SUCCEEDED = (
     getattr(GoalStatus, f"STATUS_{name}") for name in ("ABORTED", "CANCELED", "SUCCEEDED")
@@ -19,9 +19,16 @@ PARAMS = HERE.parents[1] / "ros/caryatid_ros/launch/params.yaml"
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"image_timeout": "soon"}, "error: parameter image_timeout: .*give a number from 0.1"),
+        (
+            {"image_timeout": "soon"},
+            "error: parameter image_timeout: has the wrong type; give a float, such as 5.0",
+        ),
         ({"seed": -1}, "error: parameter seed: .*out of range"),
-        ({"seed": 0.5}, "error: parameter seed: .*type"),
+        (
+            {"move_timeout": 60},
+            "error: parameter move_timeout: has the wrong type; give a float, such as 120.0",
+        ),
+        ({"depth_topic": "bad//name"}, "error: .*topic"),
         ({"planner": "best"}, "error: .*best"),
     ],
 )
@@ -36,7 +43,7 @@ def test_a_wrong_parameter_is_one_sentence(start_node, given, said):
 def test_a_parameter_file_holds_for_any_name_and_misspelt_names_are_told(tmp_path):
     file = tmp_path / "params.yaml"
     file.write_text(
-        PARAMS.read_text().replace("move_timeout: 120.0", "move_timeout: 61\n    move_timout: 60.0")
+        PARAMS.read_text().replace("move_timeout: 120.0", "move_timeout: 61.0\n    move_timout: 60.0")
     )
     node = Process(*NODE, "--ros-args", "-r", "__ns:=/lab", "-r", "__node:=eyes", "--params-file", file)
     wait_for(lambda: "move_timeout=61.0" in node.text, 30.0)
@@ -72,6 +79,23 @@ def test_ctrl_c_while_starting_is_quiet(start_node, wait):
     time.sleep(wait)
     assert node.stop()[1] <= 1.0
     assert "caryatid" not in node.text.partition("Traceback")[2]
+
+
+def test_a_leaf_fails_when_the_server_goes(start_node, client):
+    pytest.importorskip("py_trees")
+    from caryatid_ros import leaves
+
+    client.set_table(follow=False)
+    node = start_node()
+    leaf = leaves.Explore(client.action, lambda decision: None)
+    wait_for(lambda: "ready: " in node.text, 60.0)
+    leaf.tick_once()
+    at_stage(client, "waiting for the camera")
+    node.stop()
+    wait_for(lambda: leaf.tick_once() or leaf.status == leaves.Status.FAILURE, 5.0, "failure of the leaf")
+    order = leaves.order(client.service_clients["order"])
+    order.tick_once()
+    assert (order.status, order.feedback_message) == (leaves.Status.FAILURE, "there is no service order")
 
 
 def test_a_session_outlives_a_kill(start_node, client, tmp_path):

@@ -37,25 +37,15 @@ class EndedError(Exception):
 
 
 class Goal:
-    """A goal that was accepted.
-
-    Args:
-        node: The node.
-        handle: Its handle, of the action server.
-
-    Attributes:
-        inbox: What arrives from the camera.
-        buffer: The transforms.
-    """
+    """A goal that was accepted, with its handle, what arrives from the camera, and the transforms."""
 
     def __init__(self, node: Any, handle: Any, inbox: Inbox, buffer: Any) -> None:
-        self._node, self._handle, self.inbox, self.buffer = node, handle, inbox, buffer
-        self._settings = read_parameters(node)
-        self._views, self._lock = 0, Lock()
+        self._node, self._handle, self.inbox, self._buffer = node, handle, inbox, buffer
+        self._settings, self._views, self._lock = read_parameters(node), 0, Lock()
         self._end, self._awaited, self._refusal = "", False, ""
         self._watched, self._acknowledged, self._beat = False, time.monotonic(), 0.0
-        qos = qos_profile_action_status_default
-        self._status = node.create_publisher(GoalStatusArray, "explore/_action/status", qos)
+        topic, qos = "explore/_action/status", qos_profile_action_status_default
+        self._status = node.create_publisher(GoalStatusArray, topic, qos)
 
     def end(self, why: str) -> None:
         """End the goal; once this returns, it publishes no further decision."""
@@ -70,94 +60,80 @@ class Goal:
 
     def run(self) -> Any:
         """Take views until no further view is worth its path, and return the result."""
-        log, finish = self._node.get_logger(), self._handle.abort
-        r = self._handle.request
+        node, result, finish, r = self._node, Explore.Result(), self._handle.abort, self._handle.request
+        log = node.get_logger()
         log.info(f"goal: max_views {r.max_views}, goal '{r.goal}', until {r.until:g}, restart {r.restart}")
         try:
-            why = self._explore()
+            result.message = self._explore(result)
             finish = self._handle.succeed
         except EndedError as error:
-            why = str(error)
-            if why == CANCELLED:
-                self._await_canceling()
+            result.message = str(error)
+            if result.message == CANCELLED:
                 finish = self._handle.canceled
+                for _ in range(200):  # the action server, which was told to accept this, is about to do so
+                    if self._handle.is_cancel_requested:
+                        break
+                    time.sleep(0.005)
         except Exception as error:
-            why = self._node.sentence(error)
-        result = Explore.Result(message=why, views=self._views, graph=self._node.graph)
+            result.message = node.sentence(error)
+        result.views = self._views
         try:
-            log.info(f"goal ended after {self._views} views: {why}")
-            self._stage(f"idle; the last goal ended: {why}")
-            self._node.destroy_publisher(self._status)
-            self._node.goal = None  # before its client knows, who may send the next one
+            log.info(f"goal ended after {self._views} views: {result.message}")
+            node.tell_stage(f"idle; the last goal ended: {result.message}")
+            node.destroy_publisher(self._status)
+            node.goal = None  # before its client knows, who may send the next one
             finish()
         except Exception as error:  # cancelled at this moment, or the node stops
-            self._node.sentence(error)
+            node.sentence(error)
         return result
 
-    def _await_canceling(self) -> None:
-        """Wait until the action server, which was told to accept the cancellation, has done so."""
-        for _ in range(200):
-            if self._handle.is_cancel_requested:
-                return
-            time.sleep(0.005)
-
-    def _explore(self) -> str:
+    def _explore(self, result: Any) -> str:
         """Take the views, and return why no further one is worth its path."""
-        node, settings, request = self._node, self._settings, self._handle.request
-        exploration = self._result("getting ready", node.prepared)
-        since = self._until(settings.image_timeout, partial(self._later, self._now()))
-        self._do("beginning", node.begin, request)
-        limit, stop = request.max_views or exploration.max_views, None
+        s, r = self._settings, self._handle.request
+        exploration = self._result("getting ready", self._node.prepared)
+        start = self._now()
+        since = self._until(s.image_timeout, lambda: now if (now := self._now()) > start else None)
+        result.graph = self._do("beginning", exploration.begin, r)
+        limit, stop = r.max_views or exploration.max_views, None
         while stop is None:
-            self._stage(f"waiting for images of view {self._views + 1}")
-            view = self._until(settings.image_timeout, partial(self._image, since))
-            self._do(f"adding view {self._views + 1}", node.add_view, *view)
+            self._node.tell_stage(f"waiting for images of view {self._views + 1}")
+            view = self._until(s.image_timeout, partial(self._image, since))
+            result.graph = self._do(f"adding view {self._views + 1}", exploration.look, *view)
             self._views += 1
-            stop = self._move() if self._views < limit else f"maximum of {self._views} views reached"
+            refusal = "" if self._views < limit else None
+            stop = f"maximum of {self._views} views reached"
+            while refusal is not None:
+                decision, stop = self._do("planning the next view", exploration.plan, refusal)
+                refusal = None if stop is not None else self._go(decision)
             since = self._now()
-        if request.goal and all(o.id != request.goal for o in node.graph.objects):
-            stop = f"{stop}; {request.goal} was not found"
-        return stop
+        unknown = r.goal and all(o.id != r.goal for o in result.graph.objects)
+        return f"{stop}; {r.goal} was not found" if unknown else stop
 
-    def _move(self) -> str | None:
-        """Have the camera moved to the next view, or to another if it is refused.
+    def _go(self, decision: Any) -> str | None:
+        """Have the camera moved to the next view; return why it cannot go there, or None on arrival."""
+        p, frame = decision.camera.pose.position, decision.camera.header.frame_id
+        where = f"({p.x:.3f}, {p.y:.3f}, {p.z:.3f}) m in {frame}"
+        with self._lock:  # what ends the goal waits for this, or this is not published
+            self._check()
+            self._awaited, self._refusal = True, ""
+            self._node.publish("decision", decision)
+            self._handle.publish_feedback(Explore.Feedback(views=self._views, decision=decision))
+        self._node.get_logger().info(f"decision: next view at {where}: {decision.why}")
+        self._node.tell_stage(f"waiting for the camera at {where}")
+        try:
+            self._until(self._settings.move_timeout, partial(self._arrived, decision.camera.pose))
+        finally:
+            self._awaited = False
+        return self._refusal or None
 
-        Returns:
-            Why there is no next view, or None on arrival.
-        """
-        refusal = ""
-        while True:
-            decision, stop = self._do("planning the next view", self._node.plan, refusal)
-            if stop is not None:
-                return stop
-            with self._lock:  # what ends the goal waits for this, or this is not published
-                self._check()
-                self._awaited, self._refusal = True, ""
-                self._node.publishers_of["decision"].publish(decision)
-                self._handle.publish_feedback(Explore.Feedback(views=self._views, decision=decision))
-            p = decision.camera.pose.position
-            where = f"({p.x:.3f}, {p.y:.3f}, {p.z:.3f}) m in {decision.camera.header.frame_id}"
-            self._node.get_logger().info(f"decision: next view at {where}: {decision.why}")
-            self._stage(f"waiting for the camera at {where}")
-            try:
-                refusal = self._until(self._settings.move_timeout, partial(self._arrived, decision))
-            finally:
-                self._awaited = False
-            if not refusal:
-                return None
-            self._node.get_logger().warning(f"the camera cannot go to this view: {refusal}")
-
-    def _arrived(self, decision: Any) -> str | InputError:
-        """Why the camera cannot go to the next view, an error while it is elsewhere, or '' on arrival."""
-        if self._refusal:
-            return self._refusal
-        s, pose = self._settings, decision.camera.pose
-        there = self._transform(self.frame, Time())
-        if isinstance(there, InputError):
-            return there
+    def _arrived(self, pose: Any) -> Any:
+        """Whether the camera is at a pose, or was refused to go there; otherwise an error."""
+        s, there = self._settings, self._transform(self._frame, Time())
+        if self._refusal or isinstance(there, InputError):
+            return bool(self._refusal) or there
         distance, angle = _between(there.translation, there.rotation, pose.position, pose.orientation)
         if distance <= s.position_tolerance and angle <= s.angle_tolerance:
-            return ""
+            return True
         reason = (
             f"is {1e3 * distance:.1f} mm and {angle:.4f} rad from the next view after {s.move_timeout:g} s; "
             f"the tolerances are {1e3 * s.position_tolerance:g} mm and {s.angle_tolerance:g} rad"
@@ -166,15 +142,15 @@ class Goal:
         return InputError("camera", reason, remedy)
 
     def _image(self, since: float) -> Any:
-        """The newest view that the camera took while it stood still, with its pose; or why there is none."""
+        """The newest view that the camera took while it stood still, with its transform; or an error."""
         first: InputError | None = None
         try:
             for depth, info, colour in self.inbox.views(since, self._settings.slop):
-                pose = self._still(depth.header)
-                if not isinstance(pose, InputError):
-                    self.frame = depth.header.frame_id
-                    return depth, info, colour, pose
-                first = first or pose
+                found = self._still(depth.header)
+                if not isinstance(found, InputError):
+                    self._frame = depth.header.frame_id
+                    return depth, info, colour, found
+                first = first or found
         except InputError as error:
             first = first or error
         return first
@@ -188,54 +164,47 @@ class Goal:
             if isinstance(found, InputError):
                 return found
         distance, angle = _between(now.translation, now.rotation, then.translation, then.rotation)
-        speed, turn = distance / STILL, angle / STILL
-        if speed <= s.max_speed and turn <= s.max_turn:
+        if distance <= STILL * s.max_speed and angle <= STILL * s.max_turn:
             return now
-        reason = f"moves while images arrive, by {1e3 * speed:.0f} mm/s and {turn:.3f} rad/s"
-        return InputError("camera", reason, "hold it still, or raise max_speed and max_turn")
+        moves = (
+            f"moves by {1e3 * distance / STILL:.0f} mm/s and {angle / STILL:.3f} rad/s while images arrive"
+        )
+        return InputError("camera", moves, "hold it still, or raise max_speed and max_turn")
 
     def _transform(self, frame: str, when: Any) -> Any:
         """The geometry_msgs/Transform world ← frame, or an error."""
         world = self._settings.world_frame
         try:
-            found = self.buffer.lookup_transform(world, frame, when, Duration()).transform
-            q = found.rotation
+            found = self._buffer.lookup_transform(world, frame, when, Duration()).transform
+            q, error = found.rotation, "its quaternion is zero or NaN"
             if math.hypot(q.x, q.y, q.z, q.w) > 1e-6:
                 return found
-            error = "its quaternion is zero or NaN"
         except TransformException as raised:
             error = str(raised)
         at = f" at {1e-9 * when.nanoseconds:.3f} s" if when.nanoseconds else ""
-        reason, remedy = f"is unknown{at} ({error})", "publish it in tf, or set world_frame"
-        return InputError(f"transform {world} ← {frame}", reason, remedy)
-
-    def _later(self, start: float) -> float | InputError:
-        """The ROS time [s] once it has moved on."""
-        return self._now() if self._now() > start else InputError("ROS time", "has not moved on")
+        remedy = "publish it in tf, or set world_frame"
+        return InputError(f"transform {world} ← {frame}", f"is unknown{at} ({error})", remedy)
 
     def _now(self) -> float:
         return float(1e-9 * self._node.get_clock().now().nanoseconds)
-
-    def _stage(self, text: str) -> None:
-        self._node.tell_stage(text)
 
     def _do(self, stage: str, work: Callable[..., Any], *given: Any) -> Any:
         """Result of work that the node's thread for the scene does."""
         return self._result(stage, self._node.scene_thread.submit(work, *given))
 
     def _result(self, stage: str, job: Future[Any]) -> Any:
-        self._stage(stage)
+        self._node.tell_stage(stage)
         try:
+            self._check()
             while not wait([job], timeout=POLL).done:
                 self._check()
-            self._check()
         except EndedError:
             job.cancel()
             raise
         return job.result()
 
     def _until(self, seconds: float, ready: Callable[[], Any]) -> Any:
-        """Wait for a result other than an error, until a time [s] is over.
+        """Wait for a result other than None or an error, until a time [s] is over.
 
         The ROS clock measures it, or a steady clock while that stands still.
         """
@@ -243,17 +212,14 @@ class Goal:
         while True:
             self._check()
             found, now = ready(), self._now()
-            if not isinstance(found, InputError):
+            if found is not None and not isinstance(found, InputError):
                 return found
             if now != before:
                 waited, before, moved = waited + max(now - before, 0.0), now, time.monotonic()
             if time.monotonic() - moved > seconds:
-                reason, remedy = (
-                    f"stands still at {now:.3f} s",
-                    "publish /clock, or set use_sim_time to false",
-                )
-                raise InputError("ROS time", reason, remedy)
-            if waited > seconds:
+                remedy = "publish /clock, or set use_sim_time to false"
+                raise InputError("ROS time", f"stands still at {now:.3f} s", remedy)
+            if waited > seconds and found is not None:
                 raise found
             time.sleep(POLL)
 
@@ -270,19 +236,15 @@ class Goal:
 
         DDS notices only after 20 s that a process was killed.
         """
-        now, node = time.monotonic(), self._node
+        now, watched = time.monotonic(), self._watched
         if now - self._beat < BEAT:
             return True
-        self._beat = now
-        before, self._watched = self._watched, node.count_subscribers("explore/_action/feedback") > 0
-        if before and not self._watched:
-            return False
+        self._beat, self._watched = now, self._node.count_subscribers("explore/_action/feedback") > 0
         if self._status.wait_for_all_acked(Duration(seconds=0.01)):
-            self._acknowledged = now
-            info = GoalInfo(goal_id=self._handle.goal_id)
+            self._acknowledged, info = now, GoalInfo(goal_id=self._handle.goal_id)
             status = GoalStatus(goal_info=info, status=self._handle.status)
             self._status.publish(GoalStatusArray(status_list=[status]))
-        return now - self._acknowledged < SILENT
+        return now - self._acknowledged < SILENT and (self._watched or not watched)
 
 
 def _between(p: Any, q: Any, p2: Any, q2: Any) -> tuple[float, float]:

@@ -23,20 +23,16 @@ class Inbox:
     Args:
         topics: Names of the topics of `depth`, `info` and, unless there is none, `colour`.
         info: The newest camera info, which holds until the next one, or None.
-
-    Attributes:
-        counts: Number of messages of each that arrived.
     """
 
     def __init__(self, topics: Mapping[str, str], info: Any = None) -> None:
-        self.topics, self.counts = topics, dict.fromkeys(topics, 0)
+        self._topics, self._counts = topics, dict.fromkeys(topics, 0)
         self._known: dict[str, deque[Any]] = {what: deque(maxlen=KEPT) for what in topics}
-        if info is not None:
-            self._known["info"].append(info)
+        self._known["info"].extend([] if info is None else [info])
 
     def put(self, what: str, message: Any) -> None:
         """Put in a message of `depth`, `info` or `colour`."""
-        self.counts[what] += 1
+        self._counts[what] += 1
         self._known[what].append(message)
 
     def views(self, since: float, slop: float) -> Iterator[tuple[Any, Any, Any]]:
@@ -48,12 +44,12 @@ class Inbox:
             InputError: There are none; the error says which topic is the cause.
         """
         depths, infos, colours = (list(self._known.get(what, ())) for what in ("depth", "info", "colour"))
-        for what, topic in self.topics.items():
+        for what, topic in self._topics.items():
             if not self._known[what]:
-                told = ", ".join(f"{self.counts[w]} on {t}" for w, t in self.topics.items() if w != what)
+                told = ", ".join(f"{self._counts[w]} on {t}" for w, t in self._topics.items() if w != what)
                 reason = f"no message arrived, but {told}"
                 raise InputError(topic, reason, "check the topic's name, type and publisher")
-        topic, newest = self.topics["depth"], depths[-1]
+        topic, newest = self._topics["depth"], depths[-1]
         _check_frames(newest, infos[-1], "camera info")
         if (age := since - seconds_of(newest.header.stamp)) > 0.0:
             reason = f"its newest image is {age:.3f} s older than the goal or the arrival of the camera"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
-from rclpy.exceptions import ParameterException
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 
 from caryatid.errors import InputError
 
@@ -16,7 +15,7 @@ OTHERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 """Parameters, or their prefixes, that every node has."""
 
 
-def _parameter(default: Any, about: str, low: float = 0.0, high: float = 1e6) -> Any:
+def _given(default: Any, about: str, low: float = 0.0, high: float = 1e6) -> Any:
     return field(default=default, metadata={"about": about, "range": (low, high)})
 
 
@@ -24,36 +23,32 @@ def _parameter(default: Any, about: str, low: float = 0.0, high: float = 1e6) ->
 class Settings:
     """The node's parameters; those that are floats may change, which counts from the next goal on."""
 
-    world_frame: str = _parameter("map", "level, fixed frame of the graph and the views")
-    depth_topic: str = _parameter(
+    world_frame: str = _given("map", "level, fixed frame of the graph and the views")
+    depth_topic: str = _given(
         "/camera/aligned_depth_to_color/image_raw",
         "registered to colour; compressed if it ends with /compressedDepth",
     )
-    colour_topic: str = _parameter(
+    colour_topic: str = _given(
         "/camera/color/image_raw", "of the same size; compressed if it ends with /compressed; empty = none"
     )
-    info_topic: str = _parameter("/camera/color/camera_info", "of these images")
-    rectified: bool = _parameter(False, "whether the images are rectified; those of a topic …rect… are")
-    config: str = _parameter("", "TOML file of caryatid's settings; empty = defaults")
-    masks: str = _parameter("", "source of masks, onnx:FILE; empty = automatic segmentation")
-    ignore: str = _parameter("", "grey PNG, not 0 where the images show the robot itself; empty = nowhere")
-    planner: str = _parameter("support", "planner of the next view")
-    robot: str = _parameter(
-        "humanoid", "which views are reachable: humanoid, arm:FILE.npz or module:callable"
-    )
-    session: str = _parameter("", "folder that keeps the scene over a restart; empty = none")
-    seed: int = _parameter(0, "of every random choice", high=2**63 - 1)
-    slop: float = _parameter(0.02, "maximum time between the images of a view [s]", 0.0, 1.0)
-    image_timeout: float = _parameter(5.0, "maximum wait for images and their transform [s]", 0.1)
-    move_timeout: float = _parameter(120.0, "maximum wait until the camera is at the next view [s]", 0.1)
-    position_tolerance: float = _parameter(
+    info_topic: str = _given("/camera/color/camera_info", "of these images")
+    rectified: bool = _given(False, "whether the images are rectified; those of a topic …rect… are")
+    config: str = _given("", "TOML file of caryatid's settings; empty = defaults")
+    masks: str = _given("", "source of masks, onnx:FILE; empty = automatic segmentation")
+    ignore: str = _given("", "grey PNG, not 0 where the images show the robot itself; empty = nowhere")
+    planner: str = _given("support", "planner of the next view")
+    robot: str = _given("humanoid", "which views are reachable: humanoid, arm:FILE.npz or module:callable")
+    session: str = _given("", "folder that keeps the scene over a restart; empty = none")
+    seed: int = _given(0, "of every random choice", high=2**63 - 1)
+    slop: float = _given(0.02, "maximum time between the images of a view [s]", 0.0, 1.0)
+    image_timeout: float = _given(5.0, "maximum wait for images and their transform [s]", 0.1)
+    move_timeout: float = _given(120.0, "maximum wait until the camera is at the next view [s]", 0.1)
+    position_tolerance: float = _given(
         0.03, "maximum distance from the next view on arrival [m]", 0.0005, 1.0
     )
-    angle_tolerance: float = _parameter(
-        0.05, "maximum rotation from the next view on arrival [rad]", 0.0005, 3.2
-    )
-    max_speed: float = _parameter(0.02, "maximum speed of the camera while it takes a view [m/s]", 0.001)
-    max_turn: float = _parameter(0.05, "maximum rotation of the camera meanwhile [rad/s]", 0.001)
+    angle_tolerance: float = _given(0.05, "maximum rotation from the next view on arrival [rad]", 0.0005, 3.2)
+    max_speed: float = _given(0.02, "maximum speed of the camera while it takes a view [m/s]", 0.001)
+    max_turn: float = _given(0.05, "maximum rotation of the camera meanwhile [rad/s]", 0.001)
 
 
 def declare_parameters(node: Any) -> None:
@@ -62,13 +57,11 @@ def declare_parameters(node: Any) -> None:
     Raises:
         InputError: A given value has the wrong type, or is out of range.
     """
-    node.add_on_set_parameters_callback(_checked)
     names = [f.name for f in fields(Settings)]
     for f in fields(Settings):
         low, high = f.metadata["range"]
         described = ParameterDescriptor(description=f.metadata["about"])
-        if isinstance(f.default, float):  # YAML and people write 60 for 60.0
-            described.dynamic_typing = True
+        if isinstance(f.default, float):
             described.floating_point_range = [FloatingPointRange(from_value=low, to_value=float(high))]
         else:
             described.read_only = True
@@ -76,6 +69,9 @@ def declare_parameters(node: Any) -> None:
                 described.integer_range = [IntegerRange(from_value=int(low), to_value=high)]
         try:
             node.declare_parameter(f.name, f.default, described)
+        except InvalidParameterTypeException:
+            remedy = f"give a {type(f.default).__name__}, such as {f.default!r}"
+            raise InputError(f"parameter {f.name}", "has the wrong type", remedy) from None
         except ParameterException as error:
             raise InputError(f"parameter {f.name}", " ".join(str(error).split())) from None
     for name in node._parameter_overrides:  # rclpy has no public list of what was given
@@ -85,21 +81,6 @@ def declare_parameters(node: Any) -> None:
             node.get_logger().warning(f"unknown parameter '{name}' is ignored; {meant}")
 
 
-def _checked(parameters: Any) -> Any:
-    """Refuse what is not a number in range; rclpy does not check numbers of dynamic type."""
-    for p in parameters:
-        f = Settings.__dataclass_fields__.get(p.name)
-        if f is not None and isinstance(f.default, float):
-            low, high = f.metadata["range"]
-            number = isinstance(p.value, (int, float)) and not isinstance(p.value, bool)
-            if not number or not math.isfinite(p.value) or not low <= p.value <= high:
-                reason = f"{p.name} is {p.value!r}; give a number from {low:g} to {high:g}"
-                return SetParametersResult(successful=False, reason=reason)
-    return SetParametersResult(successful=True)
-
-
 def read_parameters(node: Any) -> Settings:
     """Return the present values of the parameters of an rclpy node."""
-    values: dict[str, Any] = {f.name: node.get_parameter(f.name).value for f in fields(Settings)}
-    floats = {f.name: float(values[f.name]) for f in fields(Settings) if isinstance(f.default, float)}
-    return Settings(**values | floats)
+    return Settings(**{f.name: node.get_parameter(f.name).value for f in fields(Settings)})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import traceback
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from threading import Thread
@@ -20,7 +19,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from std_msgs.msg import Header, String
+from std_msgs.msg import String
 from tf2_ros import Buffer, TransformListener
 from visualization_msgs.msg import MarkerArray
 
@@ -44,7 +43,6 @@ class ExplorationNode(Node):
     Attributes:
         prepared: Future of the Exploration, which is made in the scene's thread.
         failure: Why that failed, in one sentence; the node then stops.
-        graph: The newest graph as a message.
         goal: The goal that runs, or None.
 
     Raises:
@@ -55,24 +53,35 @@ class ExplorationNode(Node):
         super().__init__("caryatid")
         declare_parameters(self)
         self.settings = read_parameters(self)
-        self.failure, self.graph = "", SupportGraph()
+        given = {n: getattr(self.settings, f"{n}_topic") for n in ("depth", "info", "colour")}
+        try:
+            self._listened = {n: self.resolve_topic_name(topic) for n, topic in given.items() if topic}
+        except RuntimeError as error:  # of the middleware
+            raise InputError("parameters", " ".join(str(error).split()), "correct the topic") from None
+        self.failure = ""
         self.goal: Goal | None = None
         # A client that comes late must not drive to the view of an old goal.
         qos = dict.fromkeys(PUBLISHED, LATCHED) | {"decision": QoSProfile(depth=1)}
-        self.publishers_of = {n: self.create_publisher(kind, n, qos[n]) for n, kind in PUBLISHED.items()}
+        self._topics = {n: self.create_publisher(kind, n, qos[n]) for n, kind in PUBLISHED.items()}
+        handler, log = logging.Handler(logging.INFO), self.get_logger()
+        handler.emit = lambda record: (  # type: ignore[method-assign]
+            log.info(record.getMessage())
+            if record.levelno < logging.WARNING
+            else log.warning(record.getMessage())  # rclpy wants one level for each line
+        )
         for name in ("caryatid", "caryatid_ros"):
             logging.getLogger(name).setLevel(logging.INFO)
-            logging.getLogger(name).addHandler(_ToRosout(self.get_logger()))
-        self.scene_thread, self._order_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+            logging.getLogger(name).addHandler(handler)
+        self.scene_thread = ThreadPoolExecutor(1)
         self.tell_stage("starting")
         self.prepared = self.scene_thread.submit(self._prepare)
         self._info: Any = None
-        self.create_subscription(
-            CameraInfo, self.settings.info_topic, self._take_info, qos_profile_sensor_data
-        )
+        self.create_subscription(CameraInfo, given["info"], self._take_info, qos_profile_sensor_data)
         group = ReentrantCallbackGroup()
-        self.create_service(Order, "order", self._order, callback_group=group)
-        self.create_service(Removed, "removed", self._removed, callback_group=group)
+        order = partial(self._answer, ThreadPoolExecutor(1), "order")
+        self.create_service(Order, "order", order, callback_group=group)
+        removed = partial(self._answer, self.scene_thread, "remove")
+        self.create_service(Removed, "removed", removed, callback_group=group)
         self.create_service(Refused, "refused", self._refused, callback_group=group)
         self._server = ActionServer(
             self, Explore, "explore", self._execute, callback_group=group,
@@ -84,9 +93,13 @@ class ExplorationNode(Node):
         self._server.destroy()
         super().destroy_node()
 
+    def publish(self, name: str, message: Any) -> None:
+        """Publish a message under a name of PUBLISHED."""
+        self._topics[name].publish(message)
+
     def tell_stage(self, text: str) -> None:
         """Publish what the node does now."""
-        self.publishers_of["stage"].publish(String(data=text))
+        self.publish("stage", String(data=text))
 
     def sentence(self, error: Exception) -> str:
         """Describe an error in a sentence; the log has the traceback of one that nobody expected."""
@@ -100,17 +113,13 @@ class ExplorationNode(Node):
         self.get_logger().error("".join(traceback.format_exception(error)))
         return f"internal error: {type(error).__name__}: {error}; the node's log has the traceback"
 
-    # In the scene's thread
-
     def _prepare(self) -> Any:
         """Import what takes long, read the settings, open the session, and compile the kernels."""
         try:
             from caryatid.simulation.warm_up import is_warm, warm_up
-            from caryatid_ros import messages
             from caryatid_ros.exploration import Exploration
 
-            self._messages, self._make = messages, messages.make_message
-            exploration = Exploration(self.settings)
+            exploration = Exploration(self.settings, self.publish)
             if not is_warm():
                 self.get_logger().info("compiling kernels, once after installation, for about a minute")
                 self.tell_stage("compiling kernels")
@@ -119,80 +128,24 @@ class ExplorationNode(Node):
             self.failure = self.sentence(error)
             rclpy.try_shutdown()
             raise
-        self._exploration, self._header = exploration, Header(frame_id=self.settings.world_frame)
         if exploration.scene.views:
-            self._header.stamp = self.get_clock().now().to_msg()
-            self._publish_scene()
+            exploration.header.stamp = self.get_clock().now().to_msg()
+            exploration.publish()
         self.get_logger().info(f"ready: {self.settings}")
         self.tell_stage("idle")
         return exploration
-
-    def begin(self, request: Any) -> None:
-        """Begin a goal."""
-        self._exploration.begin(request.goal, request.until, request.restart)
-        self.graph = SupportGraph() if request.restart else self.graph
-
-    def add_view(self, depth: Any, info: Any, colour: Any, pose: Any) -> None:
-        """Add a view with the geometry_msgs/Transform of its camera, and publish the graph."""
-        T_world_camera = self._messages.matrix_of(pose.rotation, pose.translation, "camera")
-        rectified = self.settings.rectified or "rect" in self.settings.depth_topic.rpartition("/")[2]
-        view = self._messages.view_of(depth, info, colour, T_world_camera, rectified=rectified)
-        self._exploration.look(view)
-        self._header.stamp = depth.header.stamp
-        self._publish_scene()
-        self.get_logger().info(f"view {view.name} added: {self._exploration.scene}")
-
-    def plan(self, refusal: str) -> tuple[Any, str | None]:
-        """Plan the next view, or another one if that was refused: its Decision, or why there is none."""
-        step = self._exploration.put_aside(refusal) if refusal else self._exploration.plan()
-        if step.stop is not None or step.decision is None:
-            return None, step.stop
-        return self._messages.decision_message(self._make, step.decision, self._header), None
-
-    def _publish_scene(self) -> None:
-        scene = self._exploration.scene
-        self.graph = self._messages.graph_message(self._make, scene.graph, scene.new_changes, self._header)
-        self.publishers_of["support_graph"].publish(self.graph)
-        markers = self._messages.markers_message(self._make, scene.graph, self._header)
-        self.publishers_of["markers"].publish(markers)
-
-    def _report(self, request: Any, response: Any) -> None:
-        self.prepared.result()
-        motion, T = request.motion, None
-        if request.moved:
-            T = self._messages.matrix_of(motion.rotation, motion.translation, "motion")
-        self._exploration.removed(request.object, T)
-        self._publish_scene()
-        response.graph = self.graph
-
-    # In the thread of orders
-
-    def _plan_order(self, request: Any, response: Any) -> None:
-        found = self.prepared.result().order(request.goal, request.hands, request.steps)
-        response.lifts = self._messages.lift_messages(self._make, found)
-        response.safe, response.message = found.safe, found.refusal
-
-    # In the thread that spins
-
-    async def _order(self, request: Any, response: Any) -> Any:
-        return await self._answer(self._order_thread, self._plan_order, request, response)
-
-    async def _removed(self, request: Any, response: Any) -> Any:
-        return await self._answer(self.scene_thread, self._report, request, response)
 
     def _refused(self, request: Any, response: Any) -> Any:
         response.success = self.goal is not None and self.goal.refuse(request.reason)
         response.message = "" if response.success else "no next view is awaited"
         return response
 
-    async def _answer(
-        self, thread: ThreadPoolExecutor, work: Callable[[Any, Any], None], request: Any, response: Any
-    ) -> Any:
+    async def _answer(self, thread: ThreadPoolExecutor, what: str, request: Any, response: Any) -> Any:
         """Have a thread fill in a response; any error becomes a sentence in it."""
 
         def fill_in() -> None:
             try:
-                work(request, response)
+                getattr(self.prepared.result(), what)(request, response)
                 response.success = True
             except Exception as error:
                 response.success, response.message = False, self.sentence(error)
@@ -221,18 +174,16 @@ class ExplorationNode(Node):
 
     def _begin(self, handle: Any) -> None:
         """Listen to the camera for the new goal only, because images and transforms cost time."""
-        before, settings, buffer = set(self.subscriptions), self.settings, Buffer()
+        before, buffer, inbox = set(self.subscriptions), Buffer(), Inbox(self._listened, self._info)
         self._listener = TransformListener(buffer, self)
-        given = {"depth": settings.depth_topic, "info": settings.info_topic, "colour": settings.colour_topic}
-        topics = {what: self.resolve_topic_name(topic) for what, topic in given.items() if topic}
-        inbox = Inbox(topics, self._info)
-        for what in topics.keys() - {"info"}:
-            packed = topics[what].endswith(("/compressed", "/compressedDepth"))
-            kind, put = CompressedImage if packed else Image, partial(inbox.put, what)
-            self.create_subscription(kind, given[what], put, qos_profile_sensor_data)
-        for publisher in self.get_publishers_info_by_topic(topics["info"]):
+        for name, topic in self._listened.items():
+            packed = topic.endswith(("/compressed", "/compressedDepth"))
+            kind, put = CompressedImage if packed else Image, partial(inbox.put, name)
+            if name != "info":
+                self.create_subscription(kind, topic, put, qos_profile_sensor_data)
+        for publisher in self.get_publishers_info_by_topic(self._listened["info"]):
             if publisher.qos_profile.durability == LATCHED.durability:  # it may have published before we came
-                self.create_subscription(CameraInfo, given["info"], self._take_info, LATCHED)
+                self.create_subscription(CameraInfo, self._listened["info"], self._take_info, LATCHED)
         self.goal = Goal(self, handle, inbox, buffer)
         self._heard = set(self.subscriptions) - before
         handle.execute()
@@ -250,17 +201,3 @@ class ExplorationNode(Node):
         if self.goal is not None:
             self.goal.end(CANCELLED)
         return CancelResponse.ACCEPT
-
-
-class _ToRosout(logging.Handler):
-    """Hands on what caryatid logs."""
-
-    def __init__(self, log: Any) -> None:
-        super().__init__(logging.INFO)
-        self._log = log
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if record.levelno >= logging.WARNING:
-            self._log.warning(record.getMessage())
-        else:
-            self._log.info(record.getMessage())
