@@ -7,10 +7,12 @@ Its parameters may be changed while it runs. The camera moves to the newest `dec
 
 from __future__ import annotations
 
+import io
 import time
 from contextlib import suppress
 
 import numpy as np
+import PIL.Image
 import rclpy
 from caryatid_msgs.msg import Decision
 from geometry_msgs.msg import PoseStamped, TransformStamped
@@ -19,7 +21,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation, Slerp
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from tf2_msgs.msg import TFMessage
 
 from caryatid.benchmark.episodes import open_scene
@@ -63,6 +65,8 @@ class Table(Node):
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._depth_topic = self.create_publisher(Image, "/camera/depth", qos_profile_sensor_data)
         self._colour_topic = self.create_publisher(Image, "/camera/colour", qos_profile_sensor_data)
+        packed = CompressedImage, "/camera/depth/compressedDepth", qos_profile_sensor_data
+        self._packed_topic = self.create_publisher(*packed)
         self._info_topic = self.create_publisher(CameraInfo, "/camera/info", qos_profile_sensor_data)
         self._tf_topic = self.create_publisher(TFMessage, "/tf", 100)
         self._static_topic = self.create_publisher(TFMessage, "/tf_static", latched)
@@ -119,6 +123,13 @@ class Table(Node):
         topics, now = self._value("topics"), self.get_clock().now()
         if "depth" in topics:
             self._depth_topic.publish(self._image(depth, self._value("encoding"), now.nanoseconds))
+            if self._packed_topic.get_subscription_count():
+                message = CompressedImage(format="16UC1; compressedDepth png")
+                message.header = self._image(depth, "", now.nanoseconds).header
+                file = io.BytesIO()
+                PIL.Image.fromarray(np.round(depth * 1000.0).astype(np.uint16)).save(file, "png")
+                message.data = bytes(12) + file.getvalue()  # after the header of its transport
+                self._packed_topic.publish(message)
         if "colour" in topics:
             late = int(self._value("offset") * 1e9)
             self._colour_topic.publish(self._image(rgb, "rgb8", now.nanoseconds + late))

@@ -51,7 +51,7 @@ def test_cancel_is_answered_while_orders_are_planned(client):
     client.set_table(follow=False)
     goal = client.explore(max_views=9, restart=True)
     at_stage(client, "planning")
-    answers = [client.start_call("order", steps=1) for _ in range(4)]
+    answers = [client.start_call("order", steps=1) for _ in range(3)]
     at_stage(client, "waiting for the camera")
     for _ in range(3):
         assert within(0.3, lambda: client.call("refused", reason="").success)

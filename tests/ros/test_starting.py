@@ -81,6 +81,12 @@ def test_ctrl_c_while_starting_is_quiet(start_node, wait):
     assert "caryatid" not in node.text.partition("Traceback")[2]
 
 
+def test_depth_may_be_compressed_and_colour_missing(start_node, client):
+    start_node(depth_topic="/camera/depth/compressedDepth", colour_topic="''")
+    status, result = client.explore(max_views=1).result()
+    assert (status, len(result.graph.supports)) == (SUCCEEDED, 5)
+
+
 def test_a_leaf_fails_when_the_server_goes(start_node, client):
     pytest.importorskip("py_trees")
     from caryatid_ros import leaves
