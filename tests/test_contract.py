@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import npy, run_command, wall_of
-from test_ros import Bench, Handle, make, packed, transform_message
+from test_ros import camera_info, image, make, packed, transform_message
 from test_service import body, serving
 from test_sessions import contents, flip
 
@@ -25,6 +25,9 @@ from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
 from caryatid.sources import Source
 from caryatid.viewer.loop import LoopPage
+from caryatid_ros.exploration import Exploration
+from caryatid_ros.messages import matrix_of
+from caryatid_ros.parameters import Settings
 
 NEW = {"segmentation": "labels", "seed": 3}
 ASIDE = transforms.rigid(np.eye(3), (0.0, 0.1, 0.0))
@@ -162,34 +165,35 @@ class Service(Keeping):
 
 
 class Node(Door):
-    """The ROS node: each view is a goal that is cancelled once the next view is known."""
+    """What the ROS node does with messages; each view is a goal."""
 
     def open(self):
-        self.bench = Bench(self.folder, lambda _: self.view, config=Config())
+        self.masks, self.published = self.folder / "masks", []
+        self.masks.mkdir()
+        tell = lambda name, message: self.published.append((name, packed(message)))  # noqa: E731
+        self.exploration = Exploration(Settings(masks=str(self.masks), seed=3), tell, make)
 
     def add(self, view):
-        self.view, self.bench.T_world_camera = view, view.pose
-        handle = Handle(self.bench, moves=False, cancel_at=1, max_views=2)
-        end, result = handle.run()
+        time, transform = 100.0 + len(list(self.masks.iterdir())), transform_message(view.pose)
+        np.save(self.masks / f"{time:.3f}.npy", view.labels)
         # Masks say nothing of other views, and poses are quaternions, which differ in the last digits.
-        self.seen.append(replace(view, T_world_camera=self.bench.poses[-1], labels_are="segments"))
-        if end == "aborted":
-            raise CaryatidError(result.message)
-        assert result.views == 1
+        T_world_camera = matrix_of(transform.rotation, transform.translation, "view")
+        self.seen.append(replace(view, T_world_camera=T_world_camera, labels_are="segments"))
+        self.exploration.begin(make("caryatid_msgs/action/Explore/Goal"))
+        depth, colour = image(view.depth, "32FC1", time), image(view.rgb, "rgb8", time)
+        self.exploration.look(depth, camera_info(view), colour, transform)
         return self.graph()
 
     def take(self, object_id, T=None):
         fields = {} if T is None else {"moved": True, "motion": transform_message(T)}
-        fields["object"] = object_id
-        told = packed(self.bench.logic.removed(make("caryatid_msgs/srv/Removed/Request", **fields)))
-        if not told.success:
-            raise CaryatidError(told.message)
+        request = make("caryatid_msgs/srv/Removed/Request", object=object_id, **fields)
+        self.exploration.remove(request, make("caryatid_msgs/srv/Removed/Response"))
         return self.graph()
 
     def graph(self):
         """The graph that the node has; of what it sends, only the names are checked here."""
-        graph = self.bench.logic._explorer.scene.graph
-        (newest,) = [m for name, m in self.bench.published if name == "support_graph"][-1:]
+        graph = self.exploration.scene.graph
+        (newest,) = [m for name, m in self.published if name == "support_graph"][-1:]
         assert [o.id for o in newest.objects] == [o.id for o in graph.objects]
         return graph_text(graph)
 

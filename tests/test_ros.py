@@ -95,6 +95,12 @@ def camera_info(view):
     return make("sensor_msgs/msg/CameraInfo", height=height, width=width, k=view.K.ravel())
 
 
+def transform_message(T):
+    pose = messages.pose_message(make, T)
+    shift = make("geometry_msgs/msg/Vector3", x=pose.position.x, y=pose.position.y, z=pose.position.z)
+    return make("geometry_msgs/msg/Transform", translation=shift, rotation=pose.orientation)
+
+
 def test_a_graph_survives_the_way_to_another_node():
     blocks = [box((x, 0.3, 0.8), (0.1, 0.1 + x, 0.1)) for x in (0.0, 0.1)]
     solid = Solid.of([Polytope.around(block.outline()) for block in blocks])

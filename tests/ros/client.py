@@ -75,7 +75,7 @@ class Client(Node):
         self.create_subscription(String, "/stage", lambda m: self.stages.append(m.data), latched)
         self.action = ActionClient(self, Explore, "/explore")
         self.service_clients = {name: self.create_client(kind, f"/{name}") for name, kind in SERVICES.items()}
-        self._settings_of_table = self.create_client(SetParameters, "/table/set_parameters")
+        self._setters: dict[str, Any] = {}
 
     def __enter__(self) -> Client:
         self._spinner = MultiThreadedExecutor(num_threads=2)
@@ -105,14 +105,17 @@ class Client(Node):
 
     def set_table(self, **parameters: Any) -> None:
         """Change parameters of the table; those that are not given get their defaults."""
-        assert self._settings_of_table.wait_for_service(20.0), "there is no table"
         values = DEFAULTS | parameters
+        fixed = ("scene", "width", "focal", "rate")
+        self.set_parameters("table", {name: v for name, v in values.items() if name not in fixed})
+
+    def set_parameters(self, node: str, values: dict[str, Any]) -> None:
+        """Change parameters of a node."""
+        if node not in self._setters:
+            self._setters[node] = self.create_client(SetParameters, f"/{node}/set_parameters")
+        setter = self._setters[node]
+        assert setter.wait_for_service(20.0), f"there is no {node}"
         request = SetParameters.Request()
-        request.parameters = [
-            Parameter(name, value=value).to_parameter_msg()
-            for name, value in values.items()
-            if name not in ("scene", "width", "focal", "rate")
-        ]
-        answer = self._settings_of_table.call_async(request)
-        wait_for(answer.done, what="the table's answer")
+        request.parameters = [Parameter(n, value=value).to_parameter_msg() for n, value in values.items()]
+        wait_for((answer := setter.call_async(request)).done, what="the answer")
         assert all(result.successful for result in answer.result().results)

@@ -12,12 +12,9 @@ import time
 from pathlib import Path
 
 import pytest
+import rclpy
 
 collect_ignore = ["stand_ins", "table.py"]
-try:
-    import rclpy
-except ImportError:
-    collect_ignore += ["test_node.py", "test_starting.py"]
 
 HERE = Path(__file__).parent
 NODE = "-c", "from caryatid_ros.node import main; main()"

@@ -16,11 +16,22 @@ SUCCEEDED, CANCELED, ABORTED = (
     getattr(GoalStatus, f"STATUS_{name}") for name in ("SUCCEEDED", "CANCELED", "ABORTED")
 )
 ALL = ["depth", "colour", "info", "tf"]
-OTHER = (
-    f"import sys, time; sys.path.insert(0, '{HERE}'); import rclpy; from client import Client; rclpy.init()\n"
-)
-LATE = OTHER + "with Client() as c: time.sleep(1.5); print(len(c.decisions), len(c.graphs))"
-DYING = OTHER + "with Client() as c: c.explore(max_views=9, restart=True); print('sent'); time.sleep(60)"
+CLIENT = f"""
+import sys, time; sys.path.insert(0, "{HERE}")
+import rclpy; from client import Client; rclpy.init()
+with Client() as client:
+"""
+LATE = """
+    for _ in range(150):
+        time.sleep(0.0 if client.graphs else 0.1)
+    time.sleep(1.0)
+    print(len(client.decisions), len(client.graphs))
+"""
+DYING = """
+    client.explore(max_views=9, restart=True)
+    print("sent")
+    time.sleep(60)
+"""
 
 
 def test_a_goal_takes_views_and_ends_with_a_graph(client):
@@ -111,8 +122,8 @@ def test_a_second_goal_is_rejected_and_hands_are_checked(client):
 def test_a_late_client_gets_no_old_decision_but_the_graph(client):
     goal = client.explore(max_views=2, restart=True)
     goal.result()
-    late = Process("-c", LATE)
-    assert late.process.wait(20.0) == 0
+    late = Process("-c", CLIENT + LATE)
+    assert late.process.wait(40.0) == 0
     wait_for(lambda: late.lines)
     assert late.text == "0 1\n"
 
@@ -151,19 +162,19 @@ def test_parameters_are_described_and_read_only_where_they_do_not_change(client)
     results = ask(SetParameters, "set_parameters", request).results
     assert [r.successful for r in results] == [True] + [False] * 5
     assert "out of range" in results[1].reason
-    request.parameters = [Parameter("move_timeout", value=5.0).to_parameter_msg()]
-    ask(SetParameters, "set_parameters", request)
+    client.set_parameters("caryatid", {"move_timeout": 5.0})
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
 def test_a_goal_ends_when_its_client_dies(client, how):
     client.set_table(follow=False)
-    dying = Process("-c", DYING)
+    client.set_parameters("caryatid", {"move_timeout": 60.0})
+    dying = Process("-c", CLIENT + DYING)
     wait_for(lambda: "sent" in dying.text, 20.0)
     wait_for(lambda: "waiting for the camera" in client.stages[-1], 20.0)
     dying.stop(how)
     within(5.0, lambda: wait_for(lambda: "the client of the goal is gone" in client.stages[-1]))
-    client.set_table()
+    client.set_parameters("caryatid", {"move_timeout": 5.0})
     assert client.explore(max_views=1).result()[0] == SUCCEEDED
 
 

@@ -19,7 +19,7 @@ from caryatid.scene import Scene
 from caryatid.sessions.carried_camera import CarriedCamera
 from caryatid.sessions.session import Session, SessionConflictError
 from caryatid_ros import messages
-from caryatid_ros.messages import make_message
+from caryatid_ros.messages import Make, make_message
 from caryatid_ros.parameters import Settings
 
 log = logging.getLogger(__name__)
@@ -31,6 +31,7 @@ class Exploration:
     Args:
         settings: The node's parameters.
         publish: Called with the name of a topic and a message.
+        make: Makes a message.
 
     Attributes:
         scene: The newest scene; it is replaced, and never changes, so that other threads may read it.
@@ -41,8 +42,10 @@ class Exploration:
         InputError: The settings, masks, planner, robot or session cannot be used.
     """
 
-    def __init__(self, settings: Settings, publish: Callable[[str, Any], None]) -> None:
-        self._settings, self._publish = settings, publish
+    def __init__(
+        self, settings: Settings, publish: Callable[[str, Any], None], make: Make = make_message
+    ) -> None:
+        self._settings, self._publish, self._make = settings, publish, make
         self._config = read_settings(Path(settings.config) if settings.config else None, [])
         self.max_views = self._config.active.max_views
         self._masks = mask_source(settings.masks, self._config, settings.seed) if settings.masks else None
@@ -53,8 +56,8 @@ class Exploration:
         self._replace(
             Scene(self._config, seed=settings.seed) if self._session is None else self._session.scene
         )
-        self.graph = make_message("caryatid_msgs/msg/SupportGraph")
-        self.header = make_message("std_msgs/msg/Header", frame_id=settings.world_frame)
+        self.graph = self._make("caryatid_msgs/msg/SupportGraph")
+        self.header = self._make("std_msgs/msg/Header", frame_id=settings.world_frame)
 
     def _opened(self) -> Session:
         """The session, which is created if it does not exist."""
@@ -90,7 +93,7 @@ class Exploration:
             folder.rename(aside)
             log.info("%s: the earlier session is now %s", folder, aside)
             self._session = self._opened()
-        self.graph = make_message("caryatid_msgs/msg/SupportGraph")
+        self.graph = self._make("caryatid_msgs/msg/SupportGraph")
         self._replace(explorer.scene)
         return self.graph
 
@@ -132,9 +135,9 @@ class Exploration:
     def publish(self) -> None:
         """Publish the graph and its markers."""
         scene = self.scene
-        self.graph = messages.graph_message(make_message, scene.graph, scene.new_changes, self.header)
+        self.graph = messages.graph_message(self._make, scene.graph, scene.new_changes, self.header)
         self._publish("support_graph", self.graph)
-        self._publish("markers", messages.markers_message(make_message, scene.graph, self.header))
+        self._publish("markers", messages.markers_message(self._make, scene.graph, self.header))
 
     def plan(self, refusal: str) -> tuple[Any, str | None]:
         """Plan the next view, or another one if that was refused: its Decision, or why there is none."""
@@ -142,7 +145,7 @@ class Exploration:
         stop = step.stop or (None if refusal else self._explorer.reason_to_stop())
         if stop is not None or step.decision is None:
             return None, stop
-        return messages.decision_message(make_message, step.decision, self.header), None
+        return messages.decision_message(self._make, step.decision, self.header), None
 
     def remove(self, request: Any, response: Any) -> None:
         """Report that an object was removed or moved, publish the graph, and fill in a Removed response."""
@@ -167,7 +170,7 @@ class Exploration:
             scene.graph, scene.config, goal=request.goal or None, hands=request.hands or 1,
             steps=request.steps or None, seed=scene.seed, threads=cores(), voxels=scene.voxels,
         )  # fmt: skip
-        response.lifts = messages.lift_messages(make_message, found)
+        response.lifts = messages.lift_messages(self._make, found)
         response.safe, response.message = found.safe, found.refusal
 
     def _known(self) -> Scene:

@@ -6,9 +6,6 @@ from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.exceptions import InvalidParameterTypeException, ParameterException
-
 from caryatid.errors import InputError
 
 OTHERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
@@ -57,6 +54,9 @@ def declare_parameters(node: Any) -> None:
     Raises:
         InputError: A given value has the wrong type, or is out of range.
     """
+    from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+    from rclpy.exceptions import InvalidParameterTypeException, ParameterException
+
     names = [f.name for f in fields(Settings)]
     for f in fields(Settings):
         low, high = f.metadata["range"]
