@@ -235,6 +235,20 @@ class Report(options.Command, work="results:redraw_report"):
     """Also write a PDF (A4); replaces an existing file."""
 
 
+class Describe(options.Command, work="results:describe_model"):
+    """Describe the scene model of a run in plain text, for people and language models.
+
+    Print objects with their sizes, what supports what with which probability, what supports nothing, and
+    what is doubtful.
+
+    Usage examples:
+      caryatid describe run
+    """
+
+    run: options.RunPath
+    """Run folder, session, or graph.json."""
+
+
 class Export(options.Command, work="results:export_model"):
     """Export the scene model of a run to simulators, 3D viewers, motion and task planners, and graph tools.
 
@@ -477,8 +491,8 @@ class Completion(options.Command, work="commands:print_completion"):
 COMMANDS: dict[str, type[options.Command | Session]] = {
     command.__name__.lower(): command
     for command in (
-        Demo, Explore, Extract, View, Evaluate, Order, Clear, Import, Report, Export, Benchmark, Session,
-        Serve, Scenes, Config, Completion,
+        Demo, Explore, Extract, View, Evaluate, Order, Clear, Import, Report, Describe, Export, Benchmark,
+        Session, Serve, Scenes, Config, Completion,
     )
 }  # fmt: skip
 """The commands in the order of the help."""

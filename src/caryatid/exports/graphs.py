@@ -25,6 +25,7 @@ def to_graphml(graph: SupportGraph) -> str:
         attributes: dict[str, Any] = {"role": item.role, "label": item.label, "shape": item.shape.kind}
         attributes |= {"size": " ".join(f"{length:.6g}" for length in lengths), "x": x, "y": y, "z": z}
         attributes["colour"] = object_colour(item.label)
+        attributes |= {} if item.name is None else {"name": item.name}
         attributes |= {"occurrences": item.occurrences, "opportunities": item.opportunities}
         plain.add_node(item.id, **attributes)
     for support in graph.supports:
@@ -40,7 +41,7 @@ def to_dot(graph: SupportGraph) -> str:
     for item in graph.objects:
         colour = object_colour(item.label)
         attributes: dict[str, Any] = {
-            "label": item.id if item.role == "object" else f"{item.id} · support surface",
+            "label": item.title if item.role == "object" else f"{item.id} · support surface",
             "shape": {"cylinder": "cylinder", "sphere": "circle"}.get(item.shape.kind, "box"),
             "fillcolor": colour,
             "fontcolor": ink_on(colour),
