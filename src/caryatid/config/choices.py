@@ -19,6 +19,6 @@ ShapeKind = Literal["box", "cylinder", "sphere"]
 GripperKind = Literal["none", "parallel", "suction"]
 """Grippers; with none, every object can be grasped."""
 ExportFormat = Literal[
-    "mjcf", "urdf", "usd", "gltf", "moveit", "curobo", "pddl", "graphml", "dot",
+    "mjcf", "urdf", "usd", "gltf", "moveit", "curobo", "pddl", "graphml", "dsg", "dot",
 ]  # fmt: skip
 """Export formats of a scene model."""

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from caryatid.config import ExportConfig, ExportFormat
 from caryatid.errors import InputError
-from caryatid.exports.graphs import to_dot, to_graphml, to_pddl
+from caryatid.exports.graphs import to_dot, to_dsg, to_graphml, to_pddl
 from caryatid.exports.models import to_gltf, to_mjcf, to_urdf, to_usd
 from caryatid.exports.motion import planning_scene, to_curobo
 from caryatid.graph import SupportGraph
@@ -36,6 +36,7 @@ FORMATS: Final[dict[ExportFormat, Format]] = {
     "curobo": Format((".yml", ".yaml"), lambda graph, config, _: to_curobo(graph)),
     "pddl": Format((".pddl",), lambda graph, config, _: to_pddl(graph)),
     "graphml": Format((".graphml",), lambda graph, config, _: to_graphml(graph)),
+    "dsg": Format((".sparkdsg",), lambda graph, config, _: to_dsg(graph)),
     "dot": Format((".dot", ".gv"), lambda graph, config, _: to_dot(graph)),
 }
 """The formats by name."""
@@ -65,7 +66,7 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
 
     Raises:
         InputError: The suffix is unknown, there is nothing to export or too much, the format rejects the
-            name of an object, usd-core (extra `usd`) is not installed, or the file cannot be written.
+            name of an object, the extra of a format is not installed, or the file cannot be written.
     """
     path, config = Path(path), config or ExportConfig()
     chosen = FORMATS[format_of(path)]
