@@ -79,7 +79,7 @@ def test_metadata_for_package_indices(built):
     assert told["License-Expression"] == "BSD-3-Clause"
     assert told["Description-Content-Type"] == "text/markdown"
     assert told.get_payload() == (ROOT / "README.md").read_text()
-    extras = {"view", "serve", "ros", "benchmark", "cluster", "bench", "docs", "dev", "all"}
+    extras = {"view", "serve", "ros", "usd", "dsg", "benchmark", "cluster", "bench", "docs", "dev", "all"}
     assert set(told.get_all("Provides-Extra")) == extras
     (scripts,) = (name for name in built[0].namelist() if name.endswith("entry_points.txt"))
     assert "caryatid = caryatid.cli:run_from_shell" in built[0].read(scripts).decode()
@@ -126,6 +126,8 @@ MODULES = {
     "view": ["viser"],
     "serve": ["fastapi", "starlette", "uvicorn"],
     "ros": ["rosbags"],
+    "usd": ["pxr"],
+    "dsg": ["spark_dsg"],
     "benchmark": ["pandas", "pyarrow"],
     "cluster": ["distributed", "dask"],
 }
@@ -171,6 +173,8 @@ WORDS = {
     "view": "view {run}",
     "serve": "serve {folder}/sessions",
     "ros": "import {folder}/pour.bag --depth /d --info /i --out {folder}/pour",
+    "usd": "export {run} --out {folder}/scene.usda",
+    "dsg": "export {run} --out {folder}/scene.sparkdsg",
     "benchmark": "benchmark --out {folder}/bench",
     "cluster": "benchmark --suite smoke --scheduler tcp://127.0.0.1:1 --out {folder}/bench",
 }
@@ -181,7 +185,7 @@ def test_a_missing_extra_is_named(tmp_path, scene_file, views, extra):
     if extra == "ros":
         write_bag(tmp_path / "pour.bag", views)
     run = tmp_path / "run"
-    if extra == "view":
+    if extra in ("view", "usd", "dsg"):
         words = ["--views", 1, "--out", run, *SMALL, "--quiet", "--no-report"]
         assert run_command("explore", scene_file, *words) == 0
     before = sorted(tmp_path.rglob("*"))
