@@ -79,7 +79,7 @@ def test_metadata_for_package_indices(built):
     assert told["License-Expression"] == "BSD-3-Clause"
     assert told["Description-Content-Type"] == "text/markdown"
     assert told.get_payload() == (ROOT / "README.md").read_text()
-    extras = {"view", "serve", "ros", "benchmark", "cluster", "bench", "docs", "dev", "all"}
+    extras = {"arm", "view", "serve", "ros", "benchmark", "cluster", "bench", "docs", "dev", "all"}
     assert set(told.get_all("Provides-Extra")) == extras
     (scripts,) = (name for name in built[0].namelist() if name.endswith("entry_points.txt"))
     assert "caryatid = caryatid.cli:run_from_shell" in built[0].read(scripts).decode()
