@@ -50,12 +50,14 @@ class Arm:
             spec.worldbody.add_geom(type=kind, size=box.extents / 2.0, **placed(T_base_box))
         self.model = spec.compile()
         self.state = mink.Configuration(self.model)
-        body, joints = self.model.body(known["hand"]).id, list[int]()
+        body, links = self.model.body(known["hand"]).id, list[int]()
         while body:
-            joints += np.flatnonzero(self.model.jnt_bodyid == body).tolist()
+            links.append(body)
             body = self.model.body_parentid[body]
-        self.address = self.model.jnt_qposadr[sorted(joints)]
-        limits = np.clip(self.model.jnt_range[sorted(joints)], -np.pi, np.pi)
+        joints = np.flatnonzero(np.isin(self.model.jnt_bodyid, links))
+        self.address = self.model.jnt_qposadr[joints]
+        turns = np.clip(self.model.jnt_range[joints], -np.pi, np.pi)
+        limits = np.where(self.model.jnt_limited[joints, None], turns, (-np.pi, np.pi))
         drawn, poses = list[Array](), list[Array]()
 
         def forward(joints: Array) -> Array:
@@ -102,6 +104,10 @@ class Arm:
         """Joints that hold the gripper at a pose (4, 4), or None."""
         return self.solve(invert(self.T_world_base) @ T_world_gripper @ self.T_gripper_camera, exact=True)
 
+    def grasps(self, T_world_gripper: Array) -> NDArray[np.bool_]:
+        """Which poses (N, 4, 4) the gripper reaches."""
+        return np.array([self.grasp(T) is not None for T in T_world_gripper])
+
 
 class WristCamera:
     """The simulated camera, where the joints really hold it."""
@@ -146,20 +152,16 @@ def main(description: Path, settings: Path) -> None:
     arm = arms[0]
     write_reachability(f"{description.stem}.npz", arm.reach)
     for step in ct.explore(WristCamera(arm, stage.camera), stage.robot, config=config):
-        f1, count = score(step.graph, truth).f1, len(step.graph.objects) - 1
-        print(
-            f"view {step.index + 1} from {step.sphere.radius:.2f} m: {count} objects, F1 {f1:.2f}; ", end=""
-        )
-        print(step.stop or f"{len(step.candidates or ())} views in reach")
-
-    def reachable(T_world_gripper: Array) -> NDArray[np.bool_]:
-        return np.array([arm.grasp(T) is not None for T in T_world_gripper])
-
-    (take,) = plan_order(step.graph, config, steps=1, reachable=reachable).steps
-    assert take.grasp is not None
-    print(f"take {take.object_id}: {take.why}")
-    print("T_world_gripper", np.round(take.grasp.T_world_gripper, 3).tolist())
-    print("joints", arm.grasp(take.grasp.T_world_gripper))
+        f1, found = score(step.graph, truth).f1, f"{len(step.graph.objects) - 1} objects"
+        rest = step.stop or f"{len(step.candidates or ())} views in reach"
+        print(f"view {step.index + 1} from {step.sphere.radius:.2f} m: {found}, F1 {f1:.2f}; {rest}")
+    order = plan_order(step.graph, config, steps=1, reachable=arm.grasps)
+    for take in order.steps:
+        print(f"take {take.object_id}: {take.why}")
+        if take.grasp is not None:  # if there is a gripper
+            print("T_world_gripper", np.round(take.grasp.T_world_gripper, 3).tolist())
+            print("joints", arm.grasp(take.grasp.T_world_gripper))
+    print(order.refusal or "the lift is safe")
     assert f1 >= 0.95
 
 

@@ -273,7 +273,8 @@ class _Video:
             file = self._av.open(str(self._path))
             stream = file.streams.video[0]
         except (self._av.error.FFmpegError, OSError, IndexError) as error:
-            raise InputError(self._path, f"cannot be read ({error})", AGAIN) from None
+            reason = f"cannot be read ({getattr(error, 'strerror', error)})"
+            raise InputError(self._path, reason, AGAIN) from None
         self.size = stream.width, stream.height
         self._frames, self._last = enumerate(file.decode(stream)), -1
 
@@ -288,5 +289,5 @@ class _Video:
                     return np.asarray(frame.to_ndarray(format="rgb24"))
             reason = f"has no frame {number}"
         except self._av.error.FFmpegError as error:
-            reason = f"frame {number} cannot be decoded ({error})"
+            reason = f"frame {number} cannot be decoded ({error.strerror})"
         raise BrokenImageError(self._path, reason, AGAIN)
