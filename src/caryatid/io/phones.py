@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -63,7 +64,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     frames = [frame.decoded_by(path.resolve().name, config) for frame in reader(path, config.max_pixels)]
     if not frames:
         raise InputError(path, "has no frames with depth", "record depth too, and export it")
-    return Dataset(path, frames, is_video=True)
+    return Dataset(path, sorted(frames, key=attrgetter("time", "number")), is_video=True)
 
 
 def _reader(path: Path) -> Callable[[Path, int], Iterator[_Shot]] | None:
@@ -209,8 +210,11 @@ def _read_stray(path: Path, max_pixels: int) -> Iterator[_Shot]:
 
     def read_depth(number: int) -> NDArray[np.float32]:
         depth = images.read_depth(path / f"depth/{number:06d}.png", 1.0, max_pixels)
-        trust = path / f"confidence/{number:06d}.png"
-        return depth * images.read_mask(trust, max_pixels=max_pixels) if trust.is_file() else depth
+        file = path / f"confidence/{number:06d}.png"
+        trusted = images.read_mask(file, max_pixels=max_pixels) if file.is_file() else np.array(True)
+        if trusted.shape not in ((), depth.shape):
+            raise BrokenImageError(file, "has another size than the depth image", AGAIN)
+        return depth * trusted
 
     camera, table = path / "camera_matrix.csv", path / "odometry.csv"
     K = check_intrinsics(np.array([_numbers(row, camera, 3) for row in _read_csv(camera)]), str(camera))
@@ -270,7 +274,7 @@ class _Video:
 
     def _start(self) -> None:
         try:
-            file = self._av.open(str(self._path))
+            file = self._av.open(str(self._path), metadata_errors="replace")
             stream = file.streams.video[0]
         except (self._av.error.FFmpegError, OSError, IndexError) as error:
             reason = f"cannot be read ({getattr(error, 'strerror', error)})"
