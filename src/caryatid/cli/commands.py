@@ -156,8 +156,9 @@ class Clear(options.LiftingCommand, options.ExploringCommand, work="run:clear_ta
 class Import(options.Command, work="results:import_log"):
     """Convert a robot's log to a recording: sharp views from different viewpoints, with their poses.
 
-    Read bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), or a folder of the
-    TUM RGB-D benchmark, which needs no topics. Depth must be registered to the colour image.
+    Read bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), whose depth must be
+    registered to colour. A folder of the TUM RGB-D benchmark, of nerfstudio (transforms.json with depth),
+    Record3D or Stray Scanner needs no topics.
 
     Usage examples:
       caryatid import pour.bag --out pour
@@ -167,7 +168,7 @@ class Import(options.Command, work="results:import_log"):
 
     settings: options.Settings = options.Settings()
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """Bag, or TUM RGB-D folder with depth.txt."""
+    """Bag, TUM RGB-D folder with depth.txt, or folder of a phone's recording."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Recording to write, a folder in the BOP format; must be new or empty."""
     depth: Topic = None
