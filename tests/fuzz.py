@@ -32,6 +32,7 @@ from conftest import SMALL, SMALL_SENSOR, npy, pcd_text, run_command, write_view
 from hypothesis import HealthCheck, given, note
 from hypothesis import settings as limits
 from hypothesis import strategies as st
+from phone_files import write_nerfstudio, write_record3d, write_stray
 from test_benchmark import fill
 from test_service import body, serving
 
@@ -220,7 +221,7 @@ def damaged(name, content, rng):
     kind = Path(name).suffix
     if not content or rng.random() < 0.2:
         return damaged_bytes(content, rng)
-    if kind == ".json":
+    if kind == ".json" or name == "metadata":
         return json.dumps(damaged_document(json.loads(content), rng)).encode()
     if kind == ".jsonl":
         lines = content.splitlines()
@@ -231,7 +232,7 @@ def damaged(name, content, rng):
         return damaged_png(content, rng)
     if kind == ".npy":
         return damaged_npy(content, rng)
-    if kind in (".txt", ".xml", ".toml", ".yaml"):
+    if kind in (".txt", ".csv", ".xml", ".toml", ".yaml"):
         return damaged_text(content.decode(), rng).encode(errors="surrogatepass")
     if kind in (".pcd", ".ply"):
         end = re.search(rb"^(DATA|end_header)\b.*\n", content, re.MULTILINE).end()
@@ -280,6 +281,10 @@ def open_bag(folder):
     (bag,) = [p for p in folder.iterdir() if p.suffix == ".bag"] or [folder]
     options = OpenOptions(DEPTH, INFO, RGB, WORLD)
     import_recording(bag, folder.with_name("imported"), options, level=False, config=CONFIG)
+
+
+def open_phone(folder):
+    import_recording(folder, folder.with_name("imported"), level=False, config=CONFIG)
 
 
 def open_clouds(folder):
@@ -378,6 +383,9 @@ def whole(tmp_path_factory, views, kept_recording, kept_run, scene_file):
     write_bag(root / "bag1/a.bag", views)
     write_bag(root / "bag2", views)
     write_bag(root / "mcap", views, "mcap")
+    write_nerfstudio(root / "nerfstudio", views)
+    write_record3d(root / "record3d", views)
+    write_stray(root / "stray", views)
     shutil.copy(kept_run / "graph.json", root / "graph/graph.json")
     (root / "settings/settings.toml").write_text(write_settings(Config()))
     write_view_files(root / "capture", views[0])
@@ -428,6 +436,9 @@ test_tum = door("tum", open_tum, 400)
 test_bags_of_ros_1 = door("bag1", open_bag, 150)
 test_bags_of_ros_2 = door("bag2", open_bag, 150)
 test_bags_of_mcap = door("mcap", open_bag, 150)
+test_nerfstudio = door("nerfstudio", open_phone, 300)
+test_record3d = door("record3d", open_phone, 200)
+test_stray_scanner = door("stray", open_phone, 200)
 test_clouds = door("clouds", open_clouds, 600)
 test_scenes = door("mjcf", open_mjcf, 700)
 test_graphs = door("graph", open_graph, 600)

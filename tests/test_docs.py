@@ -97,6 +97,8 @@ def prepared(tmp_path_factory, kept_recording, scene_file, points, views):
     write_reachability(
         folder / "arm.npz", sample_reachability(gantry, SLIDES, 100_000, np.random.default_rng(0))
     )
+    shutil.copy(folder / "arm.npz", folder / "ur5e.npz")
+    shutil.copytree(ROOT / "examples/arms", folder / "examples/arms")
     camera = {"K": views[0].K.tolist(), "T_world_camera": views[0].pose.tolist()}
     (folder / "camera.json").write_text(json.dumps(camera))
     (folder / "depth.png").write_bytes(png(np.round(1e3 * views[0].depth).astype(np.uint16)))
@@ -185,6 +187,8 @@ def test_what_is_not_run_says_why():
             assert rest == "norun"
             above = before.split(f"```{language} {rest}\n{text}")[0].rstrip().splitlines()[-1]
             assert re.fullmatch(r"\*Not run .*: .+\.\*|\*Not run .*, as .+\.\*", above), text
+            if language == "python":
+                compile(text, str(page), "exec")
         elif language == "":
             assert not COMMAND.search(text), f"say which language it is, so that it is run: {text}"
 

@@ -11,6 +11,7 @@ import numpy as np
 import pydot
 import pytest
 import trimesh
+import yaml
 import yourdfpy
 from conftest import run_command
 from scipy.spatial.transform import Rotation
@@ -18,9 +19,10 @@ from synthetic import shelf_graph
 
 from caryatid.config import ExportConfig
 from caryatid.errors import InputError
-from caryatid.exports import export_graph
+from caryatid.exports import export_graph, planning_scene
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.solids import Polytope, Solid
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.io import graph_text
 from caryatid.simulation.scenes import load_scene
@@ -49,6 +51,23 @@ def graph():
             Support("o3", "o1", "top-down"),
         ),
     )
+
+
+@pytest.fixture
+def with_solid(graph):
+    """The same with a turned solid of two parts, o16, which rests on o1."""
+    low, high = (Box(at(0.0, 0.0, z), np.array([0.2, side, 0.02])) for z, side in ((0.9, 0.1), (0.92, 0.04)))
+    parts = [Polytope.around(box.outline()) for box in (low, high)]
+    o16 = SceneObject("o16", 16, Solid.of(parts).moved(at(0.0, 0.0, 0.0, (0.0, 0.1, 0.5))))
+    supports = (*graph.supports, Support("o1", "o16", probability=0.8))
+    return replace(graph, objects=(*graph.objects, o16), supports=supports)
+
+
+def same_shape(shape, corners):
+    """Whether points (N, 3) [m] span a shape to a millimetre, of each of its parts."""
+    outline = shape.outline()
+    there = np.linalg.norm(outline[:, None] - np.asarray(corners), axis=2).min(axis=1).max()
+    return there < 1e-3 and np.abs(shape.signed_distance(np.asarray(corners))).max() < 1e-3
 
 
 # Simulators
@@ -122,6 +141,200 @@ def test_urdf_has_the_poses_sizes_and_masses_of_the_model(tmp_path, graph):
         assert np.allclose(link.inertial.inertia, moments, rtol=0.02, atol=1e-9)
 
 
+def test_usd_has_the_shapes_bodies_and_colours_of_the_model(tmp_path, with_solid):
+    pxr = pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
+
+    export_graph(with_solid, tmp_path / "scene.usda")
+    stage = pxr.Usd.Stage.Open(str(tmp_path / "scene.usda"))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    boxes = UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_])
+    for item in with_solid.objects:
+        body = stage.GetPrimAtPath(f"/World/{item.id}")
+        drawn = body.GetChildren()
+        T = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(body)).T
+        assert np.allclose(T, item.shape.T_world_object, atol=1e-6)
+        assert [p.GetTypeName() for p in drawn] == {
+            "box": ["Cube"], "cylinder": ["Cylinder"], "sphere": ["Sphere"], "solid": ["Mesh", "Mesh"],
+        }[item.shape.kind]  # fmt: skip
+        for prim, part in zip(drawn, item.shape.parts, strict=True):
+            bound = boxes.ComputeRelativeBound(prim, body).ComputeAlignedRange()
+            local = part.moved(transforms.invert(item.shape.T_world_object)).outline()
+            assert np.allclose([*bound.GetMin()], local.min(axis=0), atol=1e-3)
+            assert np.allclose([*bound.GetMax()], local.max(axis=0), atol=1e-3)
+            assert prim.HasAPI(UsdPhysics.CollisionAPI)
+            colour = 255.0 * np.array(UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()[0])
+            assert "#{:02x}{:02x}{:02x}".format(*np.rint(colour).astype(int)) == object_colour(item.label)
+        assert body.HasAPI(UsdPhysics.RigidBodyAPI) == (item.role == "object")
+        density = UsdPhysics.MassAPI(body).GetDensityAttr().Get() if item.role == "object" else None
+        assert density == (600.0 if item.role == "object" else None)
+        material, _ = UsdShade.MaterialBindingAPI(body).ComputeBoundMaterial("physics")
+        friction = UsdPhysics.MaterialAPI(material.GetPrim()).GetDynamicFrictionAttr().Get()
+        assert friction == pytest.approx(0.8)
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/o16/part_1"))
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    assert trimesh.Trimesh(mesh.GetPointsAttr().Get(), faces).volume == pytest.approx(0.2 * 0.1 * 0.02)
+
+
+# Motion and task planners
+
+HEADER = {"frame_id": str}
+POINT = dict.fromkeys("xyz", float)
+POSE = {"position": POINT, "orientation": POINT | {"w": float}}
+PLANNING_SCENE = {
+    "is_diff": bool,
+    "robot_state": {"is_diff": bool},
+    "world": {
+        "collision_objects": [
+            {
+                "header": HEADER,
+                "id": str,
+                "pose": POSE,
+                "primitives": [{"type": int, "dimensions": [float]}],
+                "primitive_poses": [POSE],
+                "meshes": [{"triangles": [{"vertex_indices": [int]}], "vertices": [POINT]}],
+                "mesh_poses": [POSE],
+                "operation": int,
+            }
+        ]
+    },
+    "allowed_collision_matrix": {
+        "entry_names": [str],
+        "entry_values": [{"enabled": [bool]}],
+        "default_entry_names": [str],
+        "default_entry_values": [bool],
+    },
+}
+"""Fields that the definitions of moveit_msgs/PlanningScene and the messages in it have."""
+
+
+def check_message(value, definition):
+    if isinstance(definition, dict):
+        assert value.keys() <= definition.keys()
+        for key, item in value.items():
+            check_message(item, definition[key])
+    elif isinstance(definition, list):
+        for item in value:
+            check_message(item, definition[0])
+    else:
+        assert type(value) is definition
+
+
+def pose_of(message):
+    turn = Rotation.from_quat([message["orientation"][axis] for axis in "xyzw"])
+    return transforms.rigid(turn.as_matrix(), [message["position"][axis] for axis in "xyz"])
+
+
+def test_a_planning_scene_has_the_shapes_of_the_model(tmp_path, with_solid):
+    (tmp_path / "graph.json").write_text(graph_text(with_solid))
+    words = ("--format", "moveit", "--out", tmp_path / "scene.json", "--set", "export.frame=base_link")
+    assert run_command("export", tmp_path / "graph.json", *words) == 0
+    scene = json.loads((tmp_path / "scene.json").read_text())
+    check_message(scene, PLANNING_SCENE)
+    assert scene["is_diff"]
+    assert scene["robot_state"]["is_diff"], "or MoveIt detaches what the robot holds"
+    objects = {o["id"]: o for o in scene["world"]["collision_objects"]}
+    assert set(objects) == set(with_solid)
+    for item in with_solid.objects:
+        known = objects[item.id]
+        assert known["header"]["frame_id"] == "base_link"
+        assert known["operation"] == 0
+        T = pose_of(known["pose"])
+        if item.shape.kind == "solid":
+            assert len(known["meshes"]) == len(known["mesh_poses"]) == 2
+            for mesh, pose, part in zip(known["meshes"], known["mesh_poses"], item.shape.parts, strict=True):
+                vertices = transforms.transform(
+                    T @ pose_of(pose), [[v[a] for a in "xyz"] for v in mesh["vertices"]]
+                )
+                assert same_shape(part, vertices)
+                faces = [t["vertex_indices"] for t in mesh["triangles"]]
+                assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(part.volume)
+            continue
+        (primitive,), (pose,) = known["primitives"], known["primitive_poses"]
+        sizes = primitive["dimensions"]
+        T = T @ pose_of(pose)
+        match primitive["type"]:
+            case 1:
+                made = Box(T, np.array(sizes))
+            case 2:
+                made = Sphere(T, *sizes)
+            case 3:
+                made = Cylinder(T, radius=sizes[1], height=sizes[0])
+        assert made.kind == item.shape.kind
+        assert same_shape(item.shape, made.outline())
+
+
+def test_what_supports_an_object_may_touch_it_and_the_robot_keeps_its_own_entries(graph):
+    old = {
+        "entry_names": ["link1", "link2", "o1", "o15"],
+        "entry_values": [
+            {"enabled": [False, True, False, False]},
+            {"enabled": [True, False, True, False]},
+            {"enabled": [False, True, False, True]},
+            {"enabled": [False, False, True, False]},
+        ],
+        "default_entry_names": ["octomap"],
+        "default_entry_values": [True],
+    }
+    for given, kept in ((None, set()), (old, {("link1", "link2"), ("link2", "o1")})):
+        matrix = planning_scene(graph, allowed=given)["allowed_collision_matrix"]
+        check_message(matrix, PLANNING_SCENE["allowed_collision_matrix"])
+        names = matrix["entry_names"]
+        enabled = np.array([row["enabled"] for row in matrix["entry_values"]])
+        assert enabled.shape == (len(names), len(names))
+        assert np.array_equal(enabled, enabled.T)
+        pairs = {(names[a], names[b]) for a, b in zip(*np.nonzero(enabled), strict=True)}
+        allowed = {frozenset(pair) for pair in pairs}
+        assert allowed == {frozenset(s.pair) for s in graph.supports} | set(map(frozenset, kept))
+    assert matrix["default_entry_names"] == ["octomap"]
+
+
+def test_a_curobo_world_has_the_shapes_of_the_model(tmp_path, with_solid):
+    moved = replace(with_solid.objects[3], shape=Sphere(at(5e-5, -0.2, 0.78), 0.03))
+    graph = replace(with_solid, objects=(*with_solid.objects[:3], moved, *with_solid.objects[4:]))
+    export_graph(graph, tmp_path / "world.yml")
+    world = yaml.safe_load((tmp_path / "world.yml").read_text())
+    fields = {
+        "cuboid": {"dims"}, "cylinder": {"radius", "height"}, "sphere": {"radius"},
+        "mesh": {"vertices", "faces"},
+    }  # fmt: skip
+    assert world.keys() == fields.keys()
+    made = {}
+    for kind, obstacles in world.items():
+        for name, known in obstacles.items():
+            assert known.keys() == fields[kind] | {"pose", "color"}
+            assert [type(v) for v in known["pose"]] == [float] * 7
+            turn = Rotation.from_quat(known["pose"][3:], scalar_first=True).as_matrix()
+            T = transforms.rigid(turn, known["pose"][:3])
+            match kind:
+                case "cuboid":
+                    made[name] = Box(T, np.array(known["dims"]))
+                case "cylinder":
+                    made[name] = Cylinder(T, known["radius"], known["height"])
+                case "sphere":
+                    made[name] = Sphere(T, known["radius"])
+                case "mesh":
+                    assert trimesh.Trimesh(known["vertices"], known["faces"]).is_watertight
+                    made[name] = Solid.from_size(T, {"parts": [known["vertices"]]})
+    expected = {o.id: o.shape for o in graph.objects[:-1]}
+    expected |= {f"o16_part_{n}": part for n, part in enumerate(graph["o16"].shape.parts, start=1)}
+    assert made.keys() == expected.keys()
+    assert all(same_shape(shape, made[name].outline()) for name, shape in expected.items())
+
+
+def test_a_pddl_problem_has_the_supports(tmp_path, with_solid):
+    parse_problem = pytest.importorskip("pddl").parse_problem
+    export_graph(with_solid, tmp_path / "problem.pddl")
+    problem = parse_problem(tmp_path / "problem.pddl")
+    assert {str(o) for o in problem.objects} == {"o1", "o2", "o3", "o15", "o16"}
+    assert {str(fact) for fact in problem.init} == {
+        "(on-table o1)", "(on o2 o1)", "(on o16 o1)",
+        "(clear o2)", "(clear o15)", "(clear o16)", "(arm-empty)",
+    }  # fmt: skip
+    assert "(on o16 o1) ; by o1, bottom-up, probability 0.80" in (tmp_path / "problem.pddl").read_text()
+
+
 # Viewers
 
 
@@ -173,6 +386,31 @@ def test_dot_is_the_graph(tmp_path, graph):
     assert read.get_node('"o3"')[0].get("fillcolor") == f'"{object_colour(3)}"'
 
 
+def test_a_scene_graph_of_spark_dsg_has_objects_and_supports(tmp_path, with_solid):
+    spark_dsg = pytest.importorskip("spark_dsg", reason="spark-dsg is not installed")
+    held = replace(with_solid, supports=(Support("o16", "o1", "top-down"), *with_solid.supports))
+    export_graph(held, tmp_path / "graph.sparkdsg")
+    read = spark_dsg.DynamicSceneGraph.load(tmp_path / "graph.sparkdsg")
+    nodes = {n.attributes.metadata.get()["id"]: n for n in read.get_layer(spark_dsg.DsgLayers.OBJECTS).nodes}
+    assert nodes.keys() == set(with_solid)
+    for item in with_solid.objects:
+        known = nodes[item.id].attributes
+        box = known.bounding_box
+        assert np.allclose(known.position, item.centre_world)
+        assert np.allclose(box.dimensions, item.shape.extents, atol=1e-3)
+        assert np.allclose(box.world_P_center, item.centre_world, atol=1e-3)
+        assert np.allclose(box.world_R_center, item.shape.T_world_object[:3, :3], atol=1e-5)
+        assert "#" + bytes(known.color[:3]).hex() == object_colour(item.label)
+    ids = {node.id.value: name for name, node in nodes.items()}
+    edges = {(ids[e.source], ids[e.target]): e.info for e in read.edges}
+    assert edges.keys() == {s.pair for s in with_solid.supports}
+    assert edges["o1", "o16"].weight == pytest.approx(0.8)
+    assert edges["o1", "o2"].metadata.get() == {"kind": "lean"}
+    same = replace(with_solid, objects=tuple(replace(o, label=1) for o in with_solid.objects))
+    with pytest.raises(InputError, match="two objects have the label 1"):
+        export_graph(same, tmp_path / "same.sparkdsg")
+
+
 @pytest.mark.parametrize("name", ['say "hi" -> b; c', "back\\slash", "<b>&amp;</b>", "two\nlines Öl"])
 def test_any_name_of_an_object_stays_one_name(tmp_path, graph, name):
     objects = tuple(replace(o, id=name) if o.id == "o15" else o for o in graph.objects)
@@ -192,8 +430,24 @@ def test_any_name_of_an_object_stays_one_name(tmp_path, graph, name):
 # The command
 
 
-@pytest.mark.parametrize("name", ["s.xml", "s.urdf", "s.glb", "s.gltf", "s.graphml", "s.gv"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "s.xml",
+        "s.urdf",
+        "s.glb",
+        "s.gltf",
+        "s.graphml",
+        "s.gv",
+        "s.usda",
+        "s.sparkdsg",
+        "s.json",
+        "s.yml",
+        "s.pddl",
+    ],
+)
 def test_the_name_says_the_format_and_the_same_model_gives_the_same_bytes(tmp_path, kept_run, name, capsys):
+    pytest.importorskip({"s.usda": "pxr", "s.sparkdsg": "spark_dsg"}.get(name, "caryatid"))
     contents = set()
     for _ in range(2):
         assert run_command("export", kept_run, "--out", tmp_path / name, "--json") == 0
@@ -215,7 +469,8 @@ def test_a_graph_file_alone_can_be_exported_and_settings_count(tmp_path, graph):
     ("arguments", "said"),
     [
         (["--out", "model.step"], "the suffix is not that of any format"),
-        (["--format", "mjcf", "--out", "graph.json"], "the suffix is not that of mjcf"),
+        (["--format", "mjcf", "--out", "graph.json"], "the suffix is not that of mjcf; use .xml"),
+        (["--format", "curobo", "--out", "graph.json"], "use .yml, .yaml"),
         (["--out", "folder.urdf"], "is a directory"),
     ],
 )
@@ -247,4 +502,8 @@ def test_an_impossible_export_ends_in_one_line(tmp_path, graph, capsys):
     twice = replace(graph, objects=(graph.objects[0], replace(graph.objects[1], id="table")), supports=())
     with pytest.raises(InputError, match="MuJoCo rejects it"):
         export_graph(twice, tmp_path / "s.xml")
+    for ids in (("o 1", "o2"), ("O1", "o1"), ("1", "2")):
+        renamed = [replace(o, id=id_) for o, id_ in zip(graph.objects[1:3], ids, strict=True)]
+        with pytest.raises(InputError, match="PDDL rejects the id"):
+            export_graph(replace(graph, objects=tuple(renamed), supports=()), tmp_path / "s.pddl")
     assert list(tmp_path.iterdir()) == []

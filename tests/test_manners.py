@@ -98,7 +98,7 @@ def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, 
         ("explore tower --out x --fusion k", "Expected one of ('pc', 'sg', 'pc+sg')"),
         ("session new x --segmentation k", "Expected one of ('labels', 'auto')"),
         ("explore tower --out x --planner k", "Expected one of ('support', 'attention', 'paper', 'random'"),
-        ("export x --out x --format k", "Expected one of ('mjcf', 'urdf', 'gltf', 'graphml', 'dot')"),
+        ("export x --out x --format k", "Expected one of ('mjcf', 'urdf', 'usd', 'gltf', 'moveit'"),
         ("explore tower --out x --views 0", "0 is not an integer of at least 1"),
         ("explore tower --out x --seed -1", "-1 is not an integer of at least 0"),
         ("explore tower --out x --colour", "--colour"),
@@ -146,6 +146,7 @@ WORKING = {
     "clear": ("{scene} --views 2 --out {out} {small} {quick}", {"success", "steps", "left"}),
     "import": ("{kept}/tum --camera {kept}/tum.json --out {out}", {"recording", "views", "frames"}),
     "report": ("{run}", set()),
+    "describe": ("{run}", {"text"}),
     "export": ("{run} --out {out}.xml", {"file", "format"}),
     "benchmark": ("--out {bench}", {"results", "suites"}),
     "session new": ("{out}", {"session", "views"}),
@@ -161,7 +162,17 @@ WORKING = {
     "view": ("{run} --no-browser --port 0", set()),
 }
 """Words that make each command work, and keys of its document; `serve` and `view` go on until stopped."""
-PRINTING = "evaluate", "order", "clear", "scenes", "config", "completion", "session next", "session graph"
+PRINTING = (
+    "evaluate",
+    "order",
+    "describe",
+    "clear",
+    "scenes",
+    "config",
+    "completion",
+    "session next",
+    "session graph",
+)
 """Those that print a result also with --quiet and without --json."""
 ENDING = [name for name in WORKING if name not in ("serve", "view")]
 

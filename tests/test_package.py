@@ -20,6 +20,7 @@ from bag_files import write_bag
 from conftest import SMALL, run_command
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from phone_files import write_stray
 
 import caryatid
 
@@ -79,7 +80,8 @@ def test_metadata_for_package_indices(built):
     assert told["License-Expression"] == "BSD-3-Clause"
     assert told["Description-Content-Type"] == "text/markdown"
     assert told.get_payload() == (ROOT / "README.md").read_text()
-    extras = {"view", "serve", "ros", "benchmark", "cluster", "bench", "docs", "dev", "all"}
+    users = {"view", "serve", "ros", "usd", "dsg", "arm", "phone", "benchmark", "cluster", "all"}
+    extras = users | {"bench", "docs", "dev"}
     assert set(told.get_all("Provides-Extra")) == extras
     (scripts,) = (name for name in built[0].namelist() if name.endswith("entry_points.txt"))
     assert "caryatid = caryatid.cli:run_from_shell" in built[0].read(scripts).decode()
@@ -125,7 +127,10 @@ def test_all_that_the_package_imports_is_declared():
 MODULES = {
     "view": ["viser"],
     "serve": ["fastapi", "starlette", "uvicorn"],
+    "phone": ["av", "lzfse"],
     "ros": ["rosbags"],
+    "usd": ["pxr"],
+    "dsg": ["spark_dsg"],
     "benchmark": ["pandas", "pyarrow"],
     "cluster": ["distributed", "dask"],
 }
@@ -170,7 +175,10 @@ def test_the_core_needs_no_extra(tmp_path, scene_file):
 WORDS = {
     "view": "view {run}",
     "serve": "serve {folder}/sessions",
+    "phone": "import {folder}/scan --out {folder}/phone",
     "ros": "import {folder}/pour.bag --depth /d --info /i --out {folder}/pour",
+    "usd": "export {run} --out {folder}/scene.usda",
+    "dsg": "export {run} --out {folder}/scene.sparkdsg",
     "benchmark": "benchmark --out {folder}/bench",
     "cluster": "benchmark --suite smoke --scheduler tcp://127.0.0.1:1 --out {folder}/bench",
 }
@@ -178,10 +186,12 @@ WORDS = {
 
 @pytest.mark.parametrize("extra", WORDS)
 def test_a_missing_extra_is_named(tmp_path, scene_file, views, extra):
+    if extra == "phone":
+        write_stray(tmp_path / "scan", views)
     if extra == "ros":
         write_bag(tmp_path / "pour.bag", views)
     run = tmp_path / "run"
-    if extra == "view":
+    if extra in ("view", "usd", "dsg"):
         words = ["--views", 1, "--out", run, *SMALL, "--quiet", "--no-report"]
         assert run_command("explore", scene_file, *words) == 0
     before = sorted(tmp_path.rglob("*"))

@@ -27,6 +27,7 @@ from conftest import npy, run_command
 from caryatid import service
 from caryatid.config import Config
 from caryatid.config.settings import changed_settings
+from caryatid.exports import planning_scene
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import png
 from caryatid.manipulation.order import plan_order
@@ -96,6 +97,8 @@ def test_a_session_over_http_is_the_session(client, views):
         scene = session.scene
         rehearsed = {"gripper": {"kind": "parallel", "seen": 0.1}, "rehearsal": {"draws": 20}}
         config = changed_settings(Config(), rehearsed, "")
+        page = "/sessions/a/planning_scene?frame=base_link"
+        assert client.get(page).json() == planning_scene(scene.graph, "base_link")
         order = plan_order(scene.graph, config, goal="o2", hands=1, voxels=scene.voxels).to_json()
         assert order["steps"][0]["grasp"]["seen_free"] < 1.0
         asked = {"goal": "o2", "settings": rehearsed}

@@ -49,14 +49,15 @@ def test_commands_options_values_and_files_are_completed(offered):
     assert offered("explore", "tower", "--fusion", "") == {"pc", "sg", "pc+sg"}
     assert offered("explore", "tower", "--planner", "") >= {*BUILT_IN, "oracle"}
     assert offered("benchmark", "--suite", "") >= {"smoke", "fig5", "planners", "full"}
-    assert offered("export", "run", "--format", "") == {"mjcf", "urdf", "gltf", "graphml", "dot"}
+    formats = {"mjcf", "urdf", "usd", "gltf", "moveit", "curobo", "pddl", "graphml", "dsg", "dot"}
+    assert offered("export", "run", "--format", "") == formats
     assert "table.pcd" in offered("explore", "x", "--out", "ta")
     assert offered("extract", "tab") == {"table.pcd"}
     assert offered("order", "rec") == {"recording"}
     assert offered("explore", "t") == offered("view", "t") == {"tower"}
     assert offered("explore", "tower", "--set", "fit.h") == {"fit.hypotheses="}
     assert offered("session", "new", "s", "--set", "export.") == {"export.max_objects="} | {
-        f"export.{name}=" for name in ("corners", "density", "friction")
+        f"export.{name}=" for name in ("corners", "density", "frame", "friction")
     }
 
 

@@ -52,7 +52,8 @@ def main() -> None:
     lap("extract")
     order = json.loads(caryatid("order", "run", "--set", "rehearsal.draws=2", "--json"))
     check(len(order["steps"]) > 0, "no removal order was found")
-    for file in ("scene.xml", "scene.urdf", "scene.glb", "scene.graphml", "scene.dot"):
+    for ending in ("xml", "urdf", "glb", "json", "yml", "pddl", "graphml", "dot"):
+        file = f"scene.{ending}"
         caryatid("export", "run", "--out", file)
         check(Path(file).stat().st_size > 100, f"{file} is empty")
     caryatid("session", "new", "table")

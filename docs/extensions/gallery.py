@@ -9,10 +9,10 @@ HEADING = """Examples
 ========
 
 Short programs. Each runs when this page is built; its output follows it. Each checks its result against the
-ground truth. The client is only shown, because it needs a running service.
+ground truth. The client and the real arm are only shown, because they need a service and a model.
 """
 RUN = re.compile(r"/\d\d_")
-"""Matches the programs to run: those with a number. The client needs a running service."""
+"""Matches the programs to run: those with a number. The others need a service, or the model of an arm."""
 
 
 def copy_examples(examples: Path, destination: Path) -> None:

@@ -44,6 +44,7 @@ class SceneObject(Pictured):
         uncertainty: Uncertainty of the shape, if known.
         doubt: What is physically implausible about it, for a person to read; empty if nothing is.
         probability: Probability that its true shape agrees with `shape` by an IoU of 0.5 [1], or None.
+        name: What masks call it, such as `mug`, or None.
     """
 
     id: str
@@ -59,6 +60,12 @@ class SceneObject(Pictured):
     uncertainty: Uncertainty | None = None
     doubt: str = ""
     probability: float | None = None
+    name: str | None = None
+
+    @property
+    def title(self) -> str:
+        """Its name and id, such as `mug (o3)`; without a name its id."""
+        return self.id if self.name is None else f"{self.name} ({self.id})"
 
     @property
     def centre_world(self) -> Array:

@@ -128,6 +128,7 @@ class Scene(Pictured):
         self._ids: dict[int, str] = {}
         self._detector = ChangeDetector()
         self._labelled: bool | None = None
+        self._names: dict[str, dict[str, int]] = {}
 
     @property
     def surface(self) -> SupportSurface | None:
@@ -443,6 +444,8 @@ class Scene(Pictured):
         present = {names[k] for k in self._models.points.objects}
         self._detector.record(self.views, missing, {names[k]: why for k, why in new.items()}, present)
         self.labels = self._shown_labels(label_image(observation, source))
+        if isinstance(source, View) and given:
+            self._name_objects(source, self.labels)
         self.T_world_camera = None if observation.view is None else observation.view.T_world_camera
         if self.T_world_camera is not None:
             self.T_world_cameras = (*self.T_world_cameras, self.T_world_camera)
@@ -693,8 +696,24 @@ class Scene(Pictured):
         fused = self._fuse_graphs()
         ids = {o.id for o in fused.objects}
         stability = {i: verdict for i, verdict in newest.stability.items() if i in ids}
-        before, self.graph = self.graph, replace(fused, stability=stability)
+        before, self.graph = self.graph, self._with_names(replace(fused, stability=stability))
         self.changed = changed(before, self.graph, self.config.fusion)
+
+    def _name_objects(self, view: View, labels: NDArray[np.int32]) -> None:
+        """Vote for the object that fills most of each named mask, by the labels (H, W) of objects."""
+        for label, name in (view.names or {}).items():
+            found = labels[(view.labels == label) & (labels > 0) & (labels <= MAX_LABEL)]
+            if found.size:
+                pixels = np.bincount(found)
+                votes = self._names.get(id_ := object_id(int(pixels.argmax())), {})
+                votes = votes | {name: votes.get(name, 0) + int(pixels.max())}
+                self._names = self._names | {id_: votes}
+        self.graph = self._with_names(self.graph)
+
+    def _with_names(self, graph: SupportGraph) -> SupportGraph:
+        """The graph with the name of each object that most pixels of its masks have."""
+        names = {id_: max(votes, key=votes.__getitem__) for id_, votes in self._names.items()}
+        return replace(graph, objects=tuple(replace(o, name=names.get(o.id)) for o in graph.objects))
 
 
 class Stopwatch:

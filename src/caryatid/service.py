@@ -33,6 +33,7 @@ from starlette.requests import ClientDisconnect
 from caryatid.config import Config, SegmentationMethod
 from caryatid.config.settings import changed_settings
 from caryatid.errors import CaryatidError, InputError, PlanningError, in_one_line
+from caryatid.exports import planning_scene
 from caryatid.geometry.transforms import Array
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import read_mask
@@ -264,6 +265,11 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     def get_graph(name: Name) -> dict[str, Any]:
         """Return the support graph in the format of graph.json."""
         return graph_to_json(pool.session(name).graph)
+
+    @app.get("/sessions/{name}/planning_scene")
+    def get_planning_scene(name: Name, frame: str = "world") -> dict[str, Any]:
+        """Return the objects as a diff of MoveIt's planning scene: moveit_msgs/PlanningScene."""
+        return planning_scene(pool.session(name).graph, frame)
 
     @app.get("/sessions/{name}/next")
     def get_next_view(name: Name) -> dict[str, Any]:

@@ -156,8 +156,9 @@ class Clear(options.LiftingCommand, options.ExploringCommand, work="run:clear_ta
 class Import(options.Command, work="results:import_log"):
     """Convert a robot's log to a recording: sharp views from different viewpoints, with their poses.
 
-    Read bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), or a folder of the
-    TUM RGB-D benchmark, which needs no topics. Depth must be registered to the colour image.
+    Read bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), whose depth must be
+    registered to colour. A folder of the TUM RGB-D benchmark, of nerfstudio (transforms.json with depth),
+    Record3D or Stray Scanner needs no topics.
 
     Usage examples:
       caryatid import pour.bag --out pour
@@ -167,7 +168,7 @@ class Import(options.Command, work="results:import_log"):
 
     settings: options.Settings = options.Settings()
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """Bag, or TUM RGB-D folder with depth.txt."""
+    """Bag, TUM RGB-D folder with depth.txt, or folder of a phone's recording."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Recording to write, a folder in the BOP format; must be new or empty."""
     depth: Topic = None
@@ -235,11 +236,26 @@ class Report(options.Command, work="results:redraw_report"):
     """Also write a PDF (A4); replaces an existing file."""
 
 
+class Describe(options.Command, work="results:describe_model"):
+    """Describe the scene model of a run in plain text, for people and language models.
+
+    Print objects with their sizes, what supports what with which probability, what supports nothing, and
+    what is doubtful.
+
+    Usage examples:
+      caryatid describe run
+    """
+
+    run: options.RunPath
+    """Run folder, session, or graph.json."""
+
+
 class Export(options.Command, work="results:export_model"):
-    """Export the scene model of a run to simulators, 3D viewers and graph tools.
+    """Export the scene model of a run to simulators, 3D viewers, motion and task planners, and graph tools.
 
     Usage examples:
       caryatid export run --format mjcf --out scene.xml
+      caryatid export run --format moveit --out scene.json --set export.frame=base_link
       caryatid export run --out scene.glb
     """
 
@@ -247,9 +263,11 @@ class Export(options.Command, work="results:export_model"):
     run: options.RunPath
     """Run folder, session, or graph.json."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
-    """File to write: .xml (mjcf), .urdf, .glb, .gltf, .graphml, .dot or .gv; replaces an existing file."""
+    """File to write, with the suffix of its format; replaces an existing file."""
     format: Annotated[ExportFormat | None, options.shown(default="by the suffix of FILE")] = None
-    """mjcf: free bodies on a table; urdf: links fixed to the world; gltf: meshes; graphml, dot: the graph."""
+    """mjcf (.xml), usd: free bodies on a table; urdf: links fixed to the world; gltf (.glb): meshes;
+    moveit (.json): planning scene; curobo (.yml): world; pddl: facts; graphml, dsg (.sparkdsg), dot: the
+    graph."""
 
 
 class Benchmark(options.Command, work="results:compare_methods"):
@@ -475,8 +493,8 @@ class Completion(options.Command, work="commands:print_completion"):
 COMMANDS: dict[str, type[options.Command | Session]] = {
     command.__name__.lower(): command
     for command in (
-        Demo, Explore, Extract, View, Evaluate, Order, Clear, Import, Report, Export, Benchmark, Session,
-        Serve, Scenes, Config, Completion,
+        Demo, Explore, Extract, View, Evaluate, Order, Clear, Import, Report, Describe, Export, Benchmark,
+        Session, Serve, Scenes, Config, Completion,
     )
 }  # fmt: skip
 """The commands in the order of the help."""

@@ -1,4 +1,4 @@
-"""`caryatid import`, `evaluate`, `order`, `report`, `export` and `benchmark`: commands on what is on disk."""
+"""Commands on what is on disk: `import`, `evaluate`, `order`, `report`, `describe`, `export`, `benchmark`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from caryatid.benchmark.running import run_locally, run_on_cluster
 from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES, change_suite
 from caryatid.cli import NOT_SAFE
-from caryatid.cli.commands import Benchmark, Evaluate, Export, Import, Order, Report
+from caryatid.cli.commands import Benchmark, Describe, Evaluate, Export, Import, Order, Report
 from caryatid.cli.output import kept, table
 from caryatid.errors import InputError, needs_extra
 from caryatid.evaluation.truths import evaluate_run
@@ -30,7 +30,7 @@ from caryatid.runtime.parallel import cores
 from caryatid.sources import open_run, read_model
 from caryatid.steps import read_config, read_steps
 from caryatid.viz.report import make_report, print_pdf, read_lift, render_html
-from caryatid.viz.tables import census, order_line, order_table
+from caryatid.viz.tables import census, describe, order_line, order_table
 
 
 def import_log(command: Import) -> None:
@@ -103,6 +103,11 @@ def export_model(command: Export) -> None:
     export_graph(graph, out, config.export)
     command.output.result({"file": str(out), "format": format_}, "")
     command.output.say(f"{out}: {format_}, {census(graph)}")
+
+
+def describe_model(command: Describe) -> None:
+    text = describe(read_model(command.run)[0])
+    command.output.result({"text": text}, text)
 
 
 def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:

@@ -18,5 +18,7 @@ ShapeKind = Literal["box", "cylinder", "sphere"]
 """The primitives."""
 GripperKind = Literal["none", "parallel", "suction"]
 """Grippers; with none, every object can be grasped."""
-ExportFormat = Literal["mjcf", "urdf", "gltf", "graphml", "dot"]
+ExportFormat = Literal[
+    "mjcf", "urdf", "usd", "gltf", "moveit", "curobo", "pddl", "graphml", "dsg", "dot",
+]  # fmt: skip
 """Export formats of a scene model."""

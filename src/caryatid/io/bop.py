@@ -17,7 +17,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io import images
 from caryatid.io.datasets import Dataset, Frame, OpenOptions, find_sample
-from caryatid.io.json_files import Numbers, json_text, parse_json, read_json
+from caryatid.io.json_files import Numbers, json_text, parse_json, read_json, read_names
 from caryatid.io.staging import StagedFolder
 from caryatid.sensing.views import MAX_LABEL, View, check_intrinsics
 
@@ -60,6 +60,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
 def read_recording(folder: str | Path, config: RecordingConfig | None = None) -> Dataset:
     """Read a BOP scene folder: `scene_camera.json`, `depth/`, and where they exist `rgb/` and `mask_visib/`.
 
+    `names.json` may name the objects by their `obj_id`: {"1": "mug"}.
     Cameras, poses and the table of masks are checked here, images when a view is loaded. A rotation matrix
     that is orthonormal to 0.02 is replaced by the nearest rotation.
 
@@ -86,8 +87,10 @@ def read_recording(folder: str | Path, config: RecordingConfig | None = None) ->
             remedy = "add its camera there, or delete the image"
             raise InputError(image, "has no entry in scene_camera.json", remedy)
     masks, most = _read_masks(folder, set(cameras)), (config or RecordingConfig()).max_pixels
+    names = read_names(folder)
     frames = tuple(
-        _frame(folder, n, cameras[n], masks.get(n), f"{path}: frame {n}", most) for n in sorted(cameras)
+        _frame(folder, n, cameras[n], masks.get(n), names, f"{path}: frame {n}", most)
+        for n in sorted(cameras)
     )
     without = [f.number for f in frames if f.T_world_camera is None]
     if len(frames) > 1 and without:
@@ -151,7 +154,13 @@ def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
 
 
 def _frame(
-    folder: Path, number: int, camera: _Camera, masks: Masks | None, source: str, max_pixels: int
+    folder: Path,
+    number: int,
+    camera: _Camera,
+    masks: Masks | None,
+    names: dict[int, str] | None,
+    source: str,
+    max_pixels: int,
 ) -> Frame:
     K = check_intrinsics(camera.cam_K.reshape(3, 3), f"{source}: cam_K")
     T_world_camera = _pose(camera, source)
@@ -168,7 +177,7 @@ def _frame(
             raise InputError(depth_path, reason, "remove this frame")
         rgb = None if rgb_path is None else images.decode_image(rgb_path, max_pixels=max_pixels)
         labels = None if masks is None else _read_labels(masks, depth, max_pixels)
-        return View(depth, K, T_world_camera, rgb, labels, name=name)
+        return View(depth, K, T_world_camera, rgb, labels, name=name, names=names)
 
     return Frame(name, number, load, T_world_camera, has_labels=masks is not None)
 

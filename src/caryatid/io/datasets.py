@@ -22,7 +22,7 @@ from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import View
 
-BUILT_IN: Final = ("bop", "tum", "bags")
+BUILT_IN: Final = ("phones", "bop", "tum", "bags")
 """Modules of `caryatid.io` that are formats, in the order in which they are tried."""
 ENTRY_POINTS: Final = "caryatid.datasets"
 """Group of the entry points of other packages' formats."""
@@ -154,7 +154,7 @@ def format_of(path: Path) -> Any:
 def open_dataset(
     path: str | Path, config: RecordingConfig | None = None, options: OpenOptions | None = None
 ) -> Dataset:
-    """Open a BOP scene folder, a TUM RGB-D folder, a bag, `sample-recording`, or a format of another package.
+    """Open a BOP scene or TUM RGB-D folder, a bag, a phone's recording, or a format of another package.
 
     Raises:
         InputError: It does not exist, has an unknown format, or is damaged.
@@ -163,6 +163,7 @@ def open_dataset(
     known = format_of(path) if path.exists() else None
     if known is None:
         bags = "a bag (.bag, .mcap, .db3, or a folder with metadata.yaml)"
-        remedy = f"give a BOP scene folder, {bags}, or a TUM RGB-D folder with depth.txt"
+        phones = "a recording of nerfstudio, Record3D or Stray Scanner"
+        remedy = f"give a BOP scene folder, {bags}, a TUM RGB-D folder with depth.txt, or {phones}"
         raise InputError(path, "unknown format" if path.exists() else "no such file or folder", remedy)
     return known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())

@@ -51,6 +51,7 @@ class _Object:
     doubt: str = ""
     uncertainty: _Uncertainty | None = None
     probability: Probability | None = None
+    name: str | None = None
 
     def decoded(self, source: str) -> SceneObject:
         source = f"{source} ('{self.id}')"

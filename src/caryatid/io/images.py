@@ -157,7 +157,11 @@ def pack(value: Any) -> bytes:
             case tuple():
                 return [encoded(item, f"{path}.{number}") for number, item in enumerate(value)]
         if is_dataclass(value):
-            members = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
+            members = {
+                f.name: item
+                for f in fields(value)
+                if f.init and ((item := getattr(value, f.name)) is not None or not f.metadata.get("sparse"))
+            }
             return {"$kind": type(value).__name__} | encoded(members, path)
         return value
 

@@ -102,6 +102,16 @@ def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any
     return document
 
 
+def read_names(folder: Path) -> dict[int, str] | None:
+    """Read `names.json`, the names of labels, from a folder of masks; None without it.
+
+    Raises:
+        InputError: It is broken, or not an object of texts by number.
+    """
+    path, remedy = folder / "names.json", 'write the name of each label: {"1": "mug"}'
+    return parse_json(dict[int, str], read_json(path, remedy), path, remedy) if path.exists() else None
+
+
 def json_text(document: Mapping[str, Any]) -> str:
     """Write a document as JSON text: keys in their order, floats rounded to `DECIMALS`, no negative zero.
 

@@ -16,6 +16,7 @@ from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.io.images import MASK_MODES, decode_image, read_mask, read_npy
+from caryatid.io.json_files import read_names
 from caryatid.segmentation.observation import label_image, observe
 from caryatid.sensing.masks import labels_from_masks
 from caryatid.sensing.views import View
@@ -45,7 +46,7 @@ def with_stored_masks(folder: Path, view: View, max_pixels: int) -> View:
     """Return a view with masks from the file named after it: a label image `NAME.png`, or `NAME.npy`.
 
     NAME is the view's after the last slash. A `.npy` holds labels (H, W) or a stack of masks (N, H, W),
-    boolean or scores.
+    boolean or scores. `names.json` in the folder may name labels: {"1": "mug"}.
 
     Raises:
         InputError: There is no such file, or it is broken or of another size.
@@ -58,7 +59,7 @@ def with_stored_masks(folder: Path, view: View, max_pixels: int) -> View:
         labels = read_npy(array)
     else:
         raise InputError(folder, f"has no masks for '{name}'", f"add {image.name} or {array.name}")
-    return replace(view, labels=labels, labels_are="segments")
+    return replace(view, labels=labels, labels_are="segments", names=read_names(folder))
 
 
 def without_ignored(view: View, ignore: Path, max_pixels: int) -> View:
@@ -140,11 +141,12 @@ class OnnxMasks:
         if masks.dtype != np.bool_ and masks.size and masks.min() < 0.0:
             masks = masks > 0.0
         if masks.ndim == 3 and len(masks) == 0:
-            return replace(view, labels=np.zeros(view.depth.shape, dtype=np.int32), labels_are="segments")
+            labels = np.zeros(view.depth.shape, dtype=np.int32)
+            return replace(view, labels=labels, labels_are="segments", names=None)
         if masks.ndim == 3 and masks.shape[1:] != view.depth.shape:
             masks = np.stack([mask[_pixels(view.depth.shape, mask.shape)] for mask in masks])
         scores = np.asarray(results[1]).ravel() if len(results) > 1 else None
-        return replace(view, labels=labels_from_masks(masks, scores), labels_are="segments")
+        return replace(view, labels=labels_from_masks(masks, scores), labels_are="segments", names=None)
 
     def _prompts(self, view: View) -> Array:
         """Boxes (N, 4) around the automatic segments of a view [px]."""

@@ -45,7 +45,7 @@ LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely")
 """Libraries whose version can change a result."""
 
 BYSTANDERS = frozenset(
-    {"benchmark", "cli", "exports.py", "service.py", "sessions", "sources.py", "viewer", "viz"}
+    {"benchmark", "cli", "exports", "service.py", "sessions", "sources.py", "viewer", "viz"}
 )
 """Parts of caryatid that do not affect results, except for the modules in `DECIDING`."""
 

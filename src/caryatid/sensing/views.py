@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Literal, Protocol
@@ -10,7 +12,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from caryatid.errors import InputError
+from caryatid.errors import InputError, check_type
 from caryatid.geometry import points as kernels
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
@@ -41,6 +43,7 @@ class View(Pictured):
             (`segments`).
         ignored: Pixels (H, W) that are left out, such as those of the robot's own arm: they have no reading
             and no label. None = none.
+        names: What labels show, such as {3: "mug"}, or None; several may have one name.
 
     Raises:
         InputError: Sizes differ, depth is negative or infinite, K or the pose is not valid.
@@ -55,6 +58,7 @@ class View(Pictured):
     name: str = "view"
     labels_are: Literal["objects", "segments"] = "objects"
     ignored: NDArray[np.bool_] | None = None
+    names: Mapping[int, str] | None = dataclasses.field(default=None, metadata={"sparse": True})
 
     def __post_init__(self) -> None:
         name, assign = self.name, partial(object.__setattr__, self)
@@ -71,6 +75,10 @@ class View(Pictured):
         assign("K", check_intrinsics(self.K, name))
         if self.T_world_camera is not None:
             assign("T_world_camera", transforms.as_rigid(self.T_world_camera, f"{name}: T_world_camera"))
+        if self.names is not None:
+            check_type(f"{name}: names", self.names, Mapping, 'give a name for each label: {3: "mug"}')
+            names = {int(label): " ".join(said.split()) for label, said in self.names.items()}
+            assign("names", {label: said for label, said in names.items() if label > 0 and said})
         if self.labels_are not in ("objects", "segments"):
             raise InputError(name, f"labels_are is '{self.labels_are}'", "choose objects or segments")
         if self.labels is not None and np.ndim(self.labels) == 3:

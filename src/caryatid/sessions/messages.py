@@ -40,6 +40,7 @@ class CameraRecord:
         depth_scale: Millimetres per unit of a depth PNG.
         name: Name of the view in messages.
         labels_are: Whether a label identifies an object in all views or a segment of this view.
+        names: Names of labels, such as {"1": "mug"}.
     """
 
     K: Annotated[Array, Numbers(3, 3)]
@@ -47,6 +48,7 @@ class CameraRecord:
     depth_scale: Annotated[float, Gt(0.0)] = 1.0
     name: str = "view"
     labels_are: Literal["objects", "segments"] = "objects"
+    names: dict[int, str] | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -93,8 +95,9 @@ class Capture:
             InputError: An image is broken, too large, or of the wrong kind; sizes differ; the camera is not
                 a pinhole camera, or its pose is not a rigid transform.
         """
-        c, images = self.camera, {name: self._decoded(name, max_pixels) for name in self.images}
-        return View(K=c.K, T_world_camera=c.T_world_camera, name=c.name, labels_are=c.labels_are, **images)
+        keys = ("K", "T_world_camera", "name", "labels_are", "names")
+        given: dict[str, Any] = {key: getattr(self.camera, key) for key in keys}
+        return View(**given | {name: self._decoded(name, max_pixels) for name in self.images})
 
     def _decoded(self, key: str, max_pixels: int) -> NDArray[Any]:
         content, name = self.images[key], f"{self.camera.name}: {key}"

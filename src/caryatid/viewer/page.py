@@ -301,7 +301,7 @@ def describe_object(
         return cell_html(Section(object_id, "was removed" if taken else "not found up to this view"))
     facts = []
     for supporter, supported, kind, likely, found, why in support_table(graph).rows:
-        if object_id in (supporter.text, supported.text):
+        if item.title in (supporter.text, supported.text):
             evidence = f"{kind.text}, probability {likely.text}, {found.text} views; {why.text}"
             facts.append((f"{supporter.text} → {supported.text}", evidence))
     if item.role == "object":
@@ -310,9 +310,9 @@ def describe_object(
         moves.append(f"nothing else moves with probability {removal.rest:.2f}")
         facts += [(f"Without {object_id}", text) for text in moves]
     table = object_table(graph)
-    (row,) = (row for row in table.rows if row[0].text == object_id)
+    (row,) = (row for row in table.rows if row[0].text == item.title)
     facts += [(name, e.text) for name, e in zip(table.columns, row, strict=True) if e.text][2:]
-    return cell_html(Section(item.id, item.shape.kind, facts=facts, colour=object_colour(item.label)))
+    return cell_html(Section(item.title, item.shape.kind, facts=facts, colour=object_colour(item.label)))
 
 
 def _log_failure(drawn: Future[None]) -> None:

@@ -53,6 +53,12 @@ def object_colour(label: int) -> str:
     return _css((1.0, 0.72, 0.5)[turn % 3] * np.array(rgb(PALETTE[position])))
 
 
+def rgba(label: int) -> tuple[float, float, float, float]:
+    """Return red, green, blue and opacity, 0 … 1, of the object with this label."""
+    red, green, blue = rgb(object_colour(label))
+    return red / 255.0, green / 255.0, blue / 255.0, 1.0
+
+
 def object_stripes(label: int) -> tuple[int, ...]:
     """Return the directions of the stripes on the object with this label, which tell like colours apart."""
     if not 0 < label <= MAX_LABEL:

@@ -250,4 +250,6 @@ def _node(item: SceneObject, at: Array, half: Array, *, supported: bool) -> Elem
     if not surface:
         evidence = f"{item.occurrences}/{item.opportunities}"
         words.append(text(at[0], at[1] + 10.0, evidence, 9.5, ink_on(colour)))
-    return group([area(at + outline, colour, **rim), *inner, *words], kind, f"{item.id}: {item.shape.kind}")
+    return group(
+        [area(at + outline, colour, **rim), *inner, *words], kind, f"{item.title}: {item.shape.kind}"
+    )

@@ -76,7 +76,7 @@ def _cell_of(shown: object) -> Section:
             facts += [(name, said) for name, said in (("why", shown.why), ("doubtful", shown.doubt)) if said]
             lead = "support surface" if shown.role == "support_surface" else shown.shape.kind
             solid, colour = Figure("", draw_solid(shown.shape, shown.label)), object_colour(shown.label)
-            return Section(shown.id, lead, [solid], facts, colour=colour)
+            return Section(shown.title, lead, [solid], facts, colour=colour)
         case Shape():
             return Section(type(shown).__name__, "", [Figure("", draw_solid(shown))], _size(shown))
         case View():

@@ -57,7 +57,7 @@ def _object_row(item: SceneObject, graph: SupportGraph) -> dict[str, str | Entry
         if np.isfinite(stability.overhang):
             overhang = f"{1e3 * stability.overhang:.0f}".replace("-", "−")
     return {
-        "id": Entry(item.id, object_colour(item.label)),
+        "id": Entry(item.title, object_colour(item.label)),
         "shape": item.shape.kind,
         "size [mm]": size_of(item.shape),
         "in views": f"{item.occurrences} of {item.opportunities}",
@@ -76,11 +76,11 @@ def _object_row(item: SceneObject, graph: SupportGraph) -> dict[str, str | Entry
 
 def support_table(graph: SupportGraph) -> Table:
     """Make the table of supports: kind, probability and evidence."""
-    colour = {o.id: object_colour(o.label) for o in graph.objects}
+    shown = {o.id: Entry(o.title, object_colour(o.label)) for o in graph.objects}
     rows = (
         (
-            Entry(s.supporter, colour[s.supporter]),
-            Entry(s.supported, colour[s.supported]),
+            shown[s.supporter],
+            shown[s.supported],
             s.kind,
             Entry(f"{s.belief:.2f}{', doubtful' * s.doubtful}", doubt=s.doubtful),
             f"{s.occurrences} of {s.opportunities}",
@@ -170,7 +170,7 @@ def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
     found, told = [], set[tuple[str, frozenset[str]]]()
     for s in sorted(graph.supports, key=lambda s: abs(s.belief - 0.5)):
         if s.doubtful:
-            lead = f"{s.supporter} → {s.supported}, probability {s.belief:.2f}"
+            lead = f"{graph[s.supporter].title} → {graph[s.supported].title}, probability {s.belief:.2f}"
             found.append((lead, f"{s.why.rstrip('.')}. {_settled_by(graph, s.supporter, s.supported)}"))
     for item in graph.objects:
         poor = f"the points are {1e3 * item.residual:.1f} mm off the shape on average"
@@ -185,7 +185,7 @@ def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
         if item.probability is not None and item.probability <= DOUBTFUL:
             reasons.append(f"its pose and size are about right with probability {item.probability:.2f} only")
         if reasons:
-            found.append((item.id, f"{'; '.join(reasons)}. {_settled_by(graph, item.id)}"))
+            found.append((item.title, f"{'; '.join(reasons)}. {_settled_by(graph, item.id)}"))
     return found
 
 
@@ -207,6 +207,23 @@ def _settled_by(graph: SupportGraph, *ids: str) -> str:
     if views:
         return f"Look at {'; '.join(views)}: no view shows that side."
     return "All visible sides were seen; the rest is noise, or hidden between objects."
+
+
+def describe(graph: SupportGraph) -> str:
+    """Describe a scene model in plain text: objects, what supports them, what is free, what is doubtful."""
+    titles = {o.id: o.title for o in graph.objects}
+    lines = [f"{census(graph)}; sizes in mm, probabilities in brackets"]
+    for item in graph.objects:
+        held = [f"{titles[s.supporter]} ({s.belief:.2f})" for s in graph.supporters(item.id)]
+        role = f"supported by {' and '.join(held) or 'something unseen'}"
+        if item.role == "support_surface":
+            role = "support surface"
+        lines.append(f"- {item.title}: {item.shape.kind} {size_of(item.shape)}, {role}")
+    holding = {s.supporter for s in graph.supports}
+    free = [o.title for o in graph.objects if o.role == "object" and o.id not in holding]
+    lines.append(f"may be lifted first, since they support nothing: {', '.join(free) or 'none'}")
+    doubtful = [f"- {lead}: {reason}" for lead, reason in doubts(graph)]
+    return "\n".join([*lines, f"doubtful: {'' if doubtful else 'nothing'}".rstrip(), *doubtful]) + "\n"
 
 
 def sentence(text: str) -> str:

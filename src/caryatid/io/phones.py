@@ -1,0 +1,297 @@
+"""Recordings of phones: transforms.json of nerfstudio with depth, Record3D, and Stray Scanner.
+
+Depth of a phone has fewer pixels than its colour, which is reduced to them. ARKit's world is y up; ours is
+z up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter
+from pathlib import Path
+from typing import Annotated, Final
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from caryatid.config import RecordingConfig
+from caryatid.errors import InputError, needs_extra
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.io import images
+from caryatid.io.datasets import Dataset, Frame, OpenOptions
+from caryatid.io.images import BrokenImageError
+from caryatid.io.json_files import Numbers, parse_json, read_json
+from caryatid.io.staging import read_errors
+from caryatid.io.video import SECOND, is_pose
+from caryatid.sensing.views import View, check_intrinsics
+
+AXES: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Axes of an optical frame in those of OpenGL, whose camera looks along −z with y up."""
+Z_UP: Final = transforms.rigid([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], np.zeros(3))
+"""Pose of ARKit's world, whose y points up, in a world whose z does."""
+COLUMNS: Final = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+"""Columns of odometry.csv that are read."""
+AGAIN: Final = "export the recording again"
+"""Remedy for broken files."""
+LATEST: Final = 2**32
+"""Upper limit of times [s]: in nanoseconds, they fit in 64 bits."""
+
+
+def recognises(path: Path) -> bool:
+    """Whether a path is a recording of a phone, by the names of its files."""
+    return path.suffix == ".r3d" or _reader(path) is not None
+
+
+def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> Dataset:
+    """Open a folder of nerfstudio, Record3D or Stray Scanner.
+
+    Raises:
+        InputError: A library is not installed, a table is missing or broken, or no frame has depth.
+    """
+    reader = _reader(path)
+    if reader is None:
+        raise InputError(path, "is an archive", "unzip it, and give the folder with metadata and rgbd")
+    if options != OpenOptions():
+        remedy = f"{path} is the recording of a phone; omit them"
+        reason = "apply only to bags and TUM folders"
+        raise InputError("--depth, --info, --rgb, --tf, --camera", reason, remedy)
+    frames = [frame.decoded_by(path.resolve().name, config) for frame in reader(path, config.max_pixels)]
+    if not frames:
+        raise InputError(path, "has no frames with depth", "record depth too, and export it")
+    return Dataset(path, sorted(frames, key=attrgetter("time", "number")), is_video=True)
+
+
+def _reader(path: Path) -> Callable[[Path, int], Iterator[_Shot]] | None:
+    if (path / "transforms.json").is_file():
+        return _read_nerfstudio
+    if (path / "odometry.csv").is_file() and (path / "depth").is_dir():
+        return _read_stray
+    return _read_record3d if (path / "rgbd").is_dir() and _metadata(path).is_file() else None
+
+
+def _metadata(path: Path) -> Path:
+    """The table of a Record3D folder: `metadata` in an unzipped .r3d, `metadata.json` in other exports."""
+    return path / ("metadata" if (path / "metadata").is_file() else "metadata.json")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Shot:
+    """One frame: K (3, 3) is for colour images of a size (width, height) [px], and the world is z up."""
+
+    number: int
+    time: float
+    T_world_camera: Array
+    K: Array
+    size: tuple[int, int]
+    depth: Callable[[], NDArray[np.float32]]
+    colour: Callable[[], NDArray[np.uint8]]
+
+    def decoded_by(self, recording: str, config: RecordingConfig) -> Frame:
+        """Make a frame of a dataset."""
+        name = f"{recording}/{self.number:06d}"
+        load = partial(self._load, name, config.far)
+        return Frame(name, self.number, load, self.T_world_camera, round(self.time * SECOND))
+
+    def _load(self, name: str, far: float) -> View:
+        depth, rgb = self.depth(), self.colour()
+        if rgb.shape[1::-1] != self.size:
+            shown = "×".join(map(str, rgb.shape[1::-1]))
+            reason = f"colour has {shown} pixels, but its camera {self.size[0]}×{self.size[1]}"
+            raise InputError(name, reason, AGAIN)
+        scale = np.array(depth.shape[::-1]) / self.size
+        if abs(scale[0] / scale[1] - 1.0) > 0.02:
+            raise InputError(name, "depth and colour have different aspect ratios", "export them registered")
+        K = self.K.copy()
+        K[[0, 1], [0, 1]] *= scale
+        K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5
+        small = Image.fromarray(rgb).resize(depth.shape[::-1], Image.Resampling.BOX)
+        near = np.where(depth <= far, depth, np.float32(0.0))
+        return View(near, K, self.T_world_camera, np.array(small), name=name)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _NerfFrame:
+    """Keys of a frame, or of all frames together; a camera of four parameters, without distortion."""
+
+    file_path: str
+    transform_matrix: Annotated[Array, Numbers(4, 4, rigid=True)]
+    fl_x: float
+    fl_y: float
+    cx: float
+    cy: float
+    w: Annotated[float, Ge(1)]
+    h: Annotated[float, Ge(1)]
+    depth_file_path: str | None = None
+    depth_unit_scale_factor: Annotated[float, Gt(0), Le(1)] = 0.001
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+
+def _read_nerfstudio(path: Path, max_pixels: int) -> Iterator[_Shot]:
+    """Frames of transforms.json: poses of OpenGL cameras in a world with z up; all are taken for sharp."""
+    table = path / "transforms.json"
+    document = read_json(table)
+    frames = document.pop("frames", None)
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(table, "'frames' is not a list of objects", AGAIN)
+    for number, frame in enumerate(frames):
+        where = f"{table}: frame {number}"
+        known = parse_json(_NerfFrame, document | frame, where)
+        if known.depth_file_path is None:
+            continue
+        if any((known.k1, known.k2, known.k3, known.k4, known.p1, known.p2)):
+            raise InputError(where, "its images are distorted (k1, k2, …)", "undistort them and depth first")
+        K = np.array([[known.fl_x, 0.0, known.cx], [0.0, known.fl_y, known.cy], [0.0, 0.0, 1.0]])
+        unit = 1000.0 * known.depth_unit_scale_factor
+        yield _Shot(
+            number,
+            float(number),
+            known.transform_matrix @ AXES,
+            check_intrinsics(K, where),
+            (int(known.w), int(known.h)),
+            partial(images.read_depth, path / known.depth_file_path, unit, max_pixels),
+            partial(images.decode_image, path / known.file_path, max_pixels=max_pixels),
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Record3D:
+    """Keys of a Record3D table; K is stored column by column, poses as qx, qy, qz, qw, x, y, z."""
+
+    K: Annotated[Array, Numbers(9)]
+    poses: Annotated[Array, Numbers(-1, 7)]
+    w: Annotated[int, Ge(1)]
+    h: Annotated[int, Ge(1)]
+    dw: Annotated[int, Ge(1)]
+    dh: Annotated[int, Ge(1)]
+    fps: Annotated[float, Gt(0)] = 60.0
+
+
+def _read_record3d(path: Path, max_pixels: int) -> Iterator[_Shot]:
+    """Frames of an unzipped .r3d: poses of OpenGL cameras in ARKit's world."""
+    with needs_extra("phone", path):
+        import lzfse
+
+    def read_depth(file: Path) -> NDArray[np.float32]:
+        try:
+            metres = np.frombuffer(lzfse.decompress(file.read_bytes()), dtype="<f4")
+            return metres.reshape(known.dh, known.dw).astype(np.float32)
+        except Exception as error:  # the library raises its own, NumPy and the disk others
+            raise BrokenImageError(file, f"cannot be read ({error})", AGAIN) from None
+
+    table = _metadata(path)
+    known = parse_json(_Record3D, read_json(table), table)
+    K = check_intrinsics(known.K.reshape(3, 3).T, f"{table}: K")
+    for number, pose in enumerate(known.poses):
+        yield _Shot(
+            number,
+            number / known.fps,
+            Z_UP @ _pose([*pose[4:], *pose[:4]], f"{table}: pose {number}") @ AXES,
+            K,
+            (known.w, known.h),
+            partial(read_depth, path / f"rgbd/{number}.depth"),
+            partial(images.decode_image, path / f"rgbd/{number}.jpg", max_pixels=max_pixels),
+        )
+
+
+def _read_stray(path: Path, max_pixels: int) -> Iterator[_Shot]:
+    """Frames of Stray Scanner: poses of optical frames in ARKit's world; doubtful depth is dropped."""
+    video = _Video(path / "rgb.mp4")
+
+    def read_depth(number: int) -> NDArray[np.float32]:
+        depth = images.read_depth(path / f"depth/{number:06d}.png", 1.0, max_pixels)
+        file = path / f"confidence/{number:06d}.png"
+        trusted = images.read_mask(file, max_pixels=max_pixels) if file.is_file() else np.array(True)
+        if trusted.shape not in ((), depth.shape):
+            raise BrokenImageError(file, "has another size than the depth image", AGAIN)
+        return depth * trusted
+
+    camera, table = path / "camera_matrix.csv", path / "odometry.csv"
+    K = check_intrinsics(np.array([_numbers(row, camera, 3) for row in _read_csv(camera)]), str(camera))
+    header, *rows = _read_csv(table)
+    if missing := [name for name in COLUMNS if name not in header]:
+        raise InputError(table, f"the column '{missing[0]}' is missing", AGAIN)
+    for row in rows:
+        told = dict(zip(header, _numbers(row, table, len(header)), strict=True))
+        time, number, *pose = (told[name] for name in COLUMNS)
+        if not (0.0 <= number < LATEST and abs(time) < LATEST):
+            raise InputError(table, f"frame {number:g} at {time:g} s is impossible", AGAIN)
+        yield _Shot(
+            int(number),
+            time,
+            Z_UP @ _pose(pose, f"{table}: frame {number:.0f}"),
+            K,
+            video.size,
+            partial(read_depth, int(number)),
+            partial(video.decode, int(number)),
+        )
+
+
+def _pose(numbers: Sequence[float], where: str) -> Array:
+    """A pose (4, 4) of a translation and a quaternion, w last."""
+    if not is_pose(numbers):
+        raise InputError(where, f"{list(numbers)} is not a pose", AGAIN)
+    return transforms.rigid(Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3])
+
+
+def _read_csv(path: Path) -> list[list[str]]:
+    """Words of the rows of a CSV file that has any."""
+    with read_errors(path, AGAIN):
+        lines = path.read_bytes().decode(errors="replace").splitlines()
+    if not lines:
+        raise InputError(path, "is empty", AGAIN)
+    return [[word.strip() for word in line.split(",")] for line in lines if line.strip()]
+
+
+def _numbers(row: list[str], path: Path, count: int) -> list[float]:
+    try:
+        numbers = [float(word) for word in row]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count:
+        raise InputError(path, f"'{', '.join(row)}' is not {count} numbers", AGAIN)
+    return numbers
+
+
+class _Video:
+    """The frames of a video, decoded forwards; to go back, it starts again."""
+
+    def __init__(self, path: Path) -> None:
+        with needs_extra("phone", path):
+            import av
+        self._path, self._av = path, av
+        self._start()
+
+    def _start(self) -> None:
+        try:
+            file = self._av.open(str(self._path), metadata_errors="replace")
+            stream = file.streams.video[0]
+        except (self._av.error.FFmpegError, OSError, IndexError) as error:
+            reason = f"cannot be read ({getattr(error, 'strerror', error)})"
+            raise InputError(self._path, reason, AGAIN) from None
+        self.size = stream.width, stream.height
+        self._frames, self._last = enumerate(file.decode(stream)), -1
+
+    def decode(self, number: int) -> NDArray[np.uint8]:
+        """Decode a frame (H, W, 3)."""
+        if number <= self._last:
+            self._start()
+        try:
+            for place, frame in self._frames:
+                self._last = place
+                if place == number:
+                    return np.asarray(frame.to_ndarray(format="rgb24"))
+            reason = f"has no frame {number}"
+        except self._av.error.FFmpegError as error:
+            reason = f"frame {number} cannot be decoded ({error.strerror})"
+        raise BrokenImageError(self._path, reason, AGAIN)
