@@ -81,6 +81,18 @@ def test_ctrl_c_while_starting_is_quiet(start_node, wait):
     assert "caryatid" not in node.text.partition("Traceback")[2]
 
 
+def test_a_view_is_taken_only_after_the_camera_has_come_to_rest(start_node, client):
+    client.set_table(motion_time=2.0)
+    start_node(position_tolerance=1.0, angle_tolerance=3.0)
+    goal = client.explore(max_views=2, restart=True)
+    wait_for(lambda: goal.feedback, 30.0)
+    since = time.time()
+    status, result = goal.result()
+    stamp = result.graph.header.stamp
+    assert status == SUCCEEDED
+    assert stamp.sec + 1e-9 * stamp.nanosec > since + 1.9
+
+
 def test_depth_may_be_compressed_and_colour_missing(start_node, client):
     start_node(depth_topic="/camera/depth/compressedDepth", colour_topic="''")
     status, result = client.explore(max_views=1).result()
