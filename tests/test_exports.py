@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import mujoco
@@ -486,6 +487,17 @@ def test_a_file_of_another_kind_is_never_overwritten(
     assert told.count("\n") == 1
     assert (tmp_path / "graph.json").read_text() == "mine"
     assert {p.name for p in tmp_path.iterdir()} == {"graph.json", "folder.urdf"}
+
+
+@pytest.mark.parametrize("name", ["graph.json", "run.json"])
+def test_a_planning_scene_never_replaces_a_part_of_a_run(tmp_path, kept_run, capsys, name):
+    run = shutil.copytree(kept_run, tmp_path / "run")
+    before = (run / name).read_bytes()
+    assert run_command("export", run, "--out", run / name) == 1
+    assert "holds a scene model or run, which would be lost; give another file" in capsys.readouterr().err
+    assert (run / name).read_bytes() == before
+    for _ in range(2):
+        assert run_command("export", run, "--out", run / "scene.json") == 0
 
 
 def test_an_impossible_export_ends_in_one_line(tmp_path, graph, capsys):

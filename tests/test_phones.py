@@ -76,12 +76,13 @@ HEADER = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
             "transform_matrix",
         ),
         ("nerfstudio", {"k1": 0.1}, "its images are distorted"),
+        ("nerfstudio", {"camera_model": "EQUIRECTANGULAR"}, "its camera is EQUIRECTANGULAR, not a pinhole"),
         ("nerfstudio", {"fl_x": None}, "'fl_x'"),
         ("nerfstudio", {"w": 100}, "colour has 320×240 pixels, but its camera 100×240"),
         ("record3d", {"poses": [[0.0] * 7]}, "is not a pose"),
         ("record3d", {"poses": [[0.0] * 6]}, "'poses'"),
         ("record3d", {"K": [0.0] * 9}, "K"),
-        ("record3d", {"dw": 100}, "none of its 3 depth images is usable: 3 broken"),
+        ("record3d", {"dw": 100}, "none of its 3 depth images is usable: 3 broken, such as "),
         ("stray", {"odometry.csv": HEADER.replace("qw", "w")}, "the column 'qw' is missing"),
         ("stray", {"odometry.csv": HEADER + "1, 0, 0, 0, 0, 0, 0, 0, 0"}, "is not a pose"),
         ("stray", {"odometry.csv": HEADER + "1, 0, 0, 0, 0, 0, 0, 0, 1, 2"}, "is not 9 numbers"),
@@ -93,6 +94,20 @@ HEADER = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
 )
 def test_what_is_broken_is_refused(kind, changes, says, tmp_path, views, refused):
     refused("import", written(kind, tmp_path / "scan", views, **changes), says=says, names="scan")
+
+
+def test_depth_in_another_format_is_named(tmp_path, views, refused):
+    source = written("nerfstudio", tmp_path / "scan", views)
+    for path in source.glob("*.png"):
+        path.write_bytes(b"\x76\x2f\x31\x01")  # OpenEXR
+    refused("import", source, says="3 broken, such as " + str(source / "0.png: not an image"))
+
+
+def test_a_table_from_a_spreadsheet_has_a_byte_order_mark(tmp_path, views):
+    source = written("stray", tmp_path / "scan", views)
+    table = source / "odometry.csv"
+    table.write_bytes(b"\xef\xbb\xbf" + table.read_bytes())
+    assert run_command("import", source, "--out", tmp_path / "out") == 0
 
 
 def test_options_of_bags_and_archives_are_refused(tmp_path, views, refused):

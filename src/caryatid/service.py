@@ -268,7 +268,7 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
 
     @app.get("/sessions/{name}/planning_scene")
     def get_planning_scene(name: Name, frame: str = "world") -> dict[str, Any]:
-        """Return the objects as a diff of MoveIt's planning scene: moveit_msgs/PlanningScene."""
+        """Return a moveit_msgs/PlanningScene: objects as a diff; poses are not transformed to `frame`."""
         return planning_scene(pool.session(name).graph, frame)
 
     @app.get("/sessions/{name}/next")

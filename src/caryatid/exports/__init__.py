@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -12,7 +13,7 @@ from caryatid.exports.graphs import to_dot, to_dsg, to_graphml, to_pddl
 from caryatid.exports.models import to_gltf, to_mjcf, to_urdf, to_usd
 from caryatid.exports.motion import planning_scene, to_curobo
 from caryatid.graph import SupportGraph
-from caryatid.io.json_files import json_text
+from caryatid.io.json_files import json_text, read_json
 from caryatid.io.staging import write_file
 
 __all__ = ["ENDINGS", "FORMATS", "export_graph", "format_of", "planning_scene", "to_dot"]
@@ -65,11 +66,14 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
     """Write a scene model in the format of the file's suffix, whole or not at all; replace an existing file.
 
     Raises:
-        InputError: The suffix is unknown, there is nothing to export or too much, the format rejects the
-            name of an object, the extra of a format is not installed, or the file cannot be written.
+        InputError: The suffix is unknown, the file is a graph.json or run.json, there is nothing to export or
+            too much, the format rejects the name of an object, the extra of a format is not installed, or the
+            file cannot be written.
     """
     path, config = Path(path), config or ExportConfig()
     chosen = FORMATS[format_of(path)]
+    if _is_of_a_run(path):
+        raise InputError(path, "holds a scene model or run, which would be lost", "give another file")
     if not graph.objects:
         raise InputError("the scene model", "has no objects", "give a graph with objects")
     if len(graph.objects) > config.max_objects:
@@ -77,3 +81,10 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
         raise InputError("the scene model", reason, "raise that setting")
     content = chosen.write(graph, config, path.suffix.lower())
     write_file(path, content.encode() if isinstance(content, str) else content)
+
+
+def _is_of_a_run(path: Path) -> bool:
+    """Whether it is a graph.json or run.json: those of MoveIt have the same suffix."""
+    with suppress(InputError):
+        return path.suffix.lower() == ".json" and str(read_json(path).get("format")).startswith("caryatid/")
+    return False

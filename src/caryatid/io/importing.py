@@ -102,10 +102,12 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
     skipped = Counter(dataset.skipped)
     usable: list[Frame] = []
     sharpness: list[float] = []
+    broken = ""
     for frame in dataset.frames:
         try:
             view = frame.load()
-        except BrokenImageError:
+        except BrokenImageError as error:
+            broken = broken or f", such as {error.source}: {error.reason}"
             skipped[BROKEN] += 1
             continue
         readings = float(view.valid.mean())
@@ -119,7 +121,7 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
         remedy = "record it again, or give another --depth TOPIC"
         raise InputError(dataset.path, "has no depth images", remedy)
     if not usable:
-        reason = f"none of its {skipped.total()} depth images is usable: {reasons(skipped)}"
+        reason = f"none of its {skipped.total()} depth images is usable: {reasons(skipped)}{broken}"
         raise InputError(dataset.path, reason, _REMEDIES.get(skipped.most_common(1)[0][0], "record it again"))
     times = np.array([(frame.time - usable[0].time) / SECOND for frame in usable])
     poses = [frame.T_world_camera for frame in usable if frame.T_world_camera is not None]

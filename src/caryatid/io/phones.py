@@ -37,6 +37,8 @@ Z_UP: Final = transforms.rigid([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.
 """Pose of ARKit's world, whose y points up, in a world whose z does."""
 COLUMNS: Final = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 """Columns of odometry.csv that are read."""
+PINHOLES: Final = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
+"""Camera models of nerfstudio that are pinholes where the images are not distorted."""
 AGAIN: Final = "export the recording again"
 """Remedy for broken files."""
 LATEST: Final = 2**32
@@ -129,6 +131,7 @@ class _NerfFrame:
     h: Annotated[float, Ge(1)]
     depth_file_path: str | None = None
     depth_unit_scale_factor: Annotated[float, Gt(0), Le(1)] = 0.001
+    camera_model: str = "PINHOLE"
     k1: float = 0.0
     k2: float = 0.0
     k3: float = 0.0
@@ -149,6 +152,10 @@ def _read_nerfstudio(path: Path, max_pixels: int) -> Iterator[_Shot]:
         known = parse_json(_NerfFrame, document | frame, where)
         if known.depth_file_path is None:
             continue
+        if known.camera_model not in PINHOLES:
+            raise InputError(
+                where, f"its camera is {known.camera_model}, not a pinhole", "undistort its images"
+            )
         if any((known.k1, known.k2, known.k3, known.k4, known.p1, known.p2)):
             raise InputError(where, "its images are distorted (k1, k2, …)", "undistort them and depth first")
         K = np.array([[known.fl_x, 0.0, known.cx], [0.0, known.fl_y, known.cy], [0.0, 0.0, 1.0]])
@@ -247,7 +254,7 @@ def _pose(numbers: Sequence[float], where: str) -> Array:
 def _read_csv(path: Path) -> list[list[str]]:
     """Words of the rows of a CSV file that has any."""
     with read_errors(path, AGAIN):
-        lines = path.read_bytes().decode(errors="replace").splitlines()
+        lines = path.read_bytes().decode("utf-8-sig", errors="replace").splitlines()
     if not lines:
         raise InputError(path, "is empty", AGAIN)
     return [[word.strip() for word in line.split(",")] for line in lines if line.strip()]
