@@ -278,7 +278,8 @@ def test_what_supports_an_object_may_touch_it_and_the_robot_keeps_its_own_entrie
         "default_entry_names": ["octomap"],
         "default_entry_values": [True],
     }
-    for given, kept in ((None, set()), (old, {("link1", "link2"), ("link2", "o1")})):
+    assert "allowed_collision_matrix" not in planning_scene(graph)
+    for given, kept in (({}, set()), (old, {("link1", "link2"), ("link2", "o1")})):
         matrix = planning_scene(graph, allowed=given)["allowed_collision_matrix"]
         check_message(matrix, PLANNING_SCENE["allowed_collision_matrix"])
         names = matrix["entry_names"]

@@ -120,7 +120,7 @@ def test_a_description_says_what_supports_what_and_what_is_free(views):
     assert lines[0].startswith("2 objects, 2 supports, 1 of them doubtful")
     (mug,) = (line for line in lines if line.startswith("- mug (o1)"))
     assert mug.endswith("supported by tray (o2) (0.60)")
-    assert "may be lifted first, since they support nothing: mug (o1)" in lines
+    assert "support nothing (`caryatid order` rehearses lifting them): mug (o1)" in lines
     assert lines[lines.index("doubtful:") + 1].startswith(
         "- tray (o2) → mug (o1), probability 0.60: it rests"
     )

@@ -24,16 +24,16 @@ ADD: Final = 0
 def planning_scene(
     graph: SupportGraph, frame: str = "world", allowed: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Make a diff of MoveIt's planning scene: each object and surface, and which pairs may touch.
+    """Make a diff of MoveIt's planning scene: each object and surface and, if wanted, which pairs may touch.
 
     Objects may touch what supports them, so that one in the gripper can be lifted off. MoveIt replaces its
-    whole matrix of allowed collisions by that of a diff: give the present one, for the links of the robot to
-    keep theirs.
+    whole matrix of allowed collisions by that of a diff, so that without the present one, no matrix is given:
+    the links of the robot would lose theirs.
 
     Args:
         graph: The scene model.
         frame: Name of its frame in tf.
-        allowed: The present moveit_msgs/AllowedCollisionMatrix to extend, or None.
+        allowed: The present moveit_msgs/AllowedCollisionMatrix to extend; None = leave it as it is.
 
     Returns:
         A moveit_msgs/PlanningScene; what is not named has its default. `operation`, a byte, is a number.
@@ -52,8 +52,7 @@ def planning_scene(
         "is_diff": True,
         "robot_state": {"is_diff": True},  # else MoveIt drops what the robot holds
         "world": {"collision_objects": objects},
-        "allowed_collision_matrix": _extended(allowed or {}, graph),
-    }
+    } | ({} if allowed is None else {"allowed_collision_matrix": _extended(allowed, graph)})
 
 
 def _extended(allowed: Mapping[str, Any], graph: SupportGraph) -> dict[str, Any]:

@@ -221,7 +221,7 @@ def describe(graph: SupportGraph) -> str:
         lines.append(f"- {item.title}: {item.shape.kind} {size_of(item.shape)}, {role}")
     holding = {s.supporter for s in graph.supports}
     free = [o.title for o in graph.objects if o.role == "object" and o.id not in holding]
-    lines.append(f"may be lifted first, since they support nothing: {', '.join(free) or 'none'}")
+    lines.append(f"support nothing (`caryatid order` rehearses lifting them): {', '.join(free) or 'none'}")
     doubtful = [f"- {lead}: {reason}" for lead, reason in doubts(graph)]
     return "\n".join([*lines, f"doubtful: {'' if doubtful else 'nothing'}".rstrip(), *doubtful]) + "\n"
 
