@@ -16,7 +16,7 @@ from caryatid.graph import SupportGraph
 from caryatid.io.json_files import json_text, read_json
 from caryatid.io.staging import write_file
 
-__all__ = ["ENDINGS", "FORMATS", "export_graph", "format_of", "planning_scene", "to_dot"]
+__all__ = ["ENDINGS", "export_graph", "format_of", "planning_scene", "to_dot"]
 
 
 class Format(NamedTuple):
