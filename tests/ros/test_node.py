@@ -197,7 +197,7 @@ def test_leaves_fail_when_there_is_no_server_and_succeed_with_one(client):
     order = leaves.order(client.service_clients["order"], steps=1)
     wait_for(lambda: ended(order), 30.0)
     assert order.response.lifts
-    leaf = leaves.Explore(client.action, went.append)
+    leaf = leaves.Explore(client.action, went.append, restart=True)
     client.set_table(follow=False)
     leaf.tick_once()
     at_stage(client, "waiting for the camera")
