@@ -444,7 +444,7 @@ class Scene(Pictured):
         present = {names[k] for k in self._models.points.objects}
         self._detector.record(self.views, missing, {names[k]: why for k, why in new.items()}, present)
         self.labels = self._shown_labels(label_image(observation, source))
-        if isinstance(source, View) and given:
+        if isinstance(source, View) and given and source.names:
             self._name_objects(source, self.labels)
         self.T_world_camera = None if observation.view is None else observation.view.T_world_camera
         if self.T_world_camera is not None:
@@ -701,7 +701,8 @@ class Scene(Pictured):
 
     def _name_objects(self, view: View, labels: NDArray[np.int32]) -> None:
         """Vote for the object that fills most of each named mask, by the labels (H, W) of objects."""
-        for label, name in (view.names or {}).items():
+        assert view.names is not None
+        for label, name in view.names.items():
             found = labels[(view.labels == label) & (labels > 0) & (labels <= MAX_LABEL)]
             if found.size:
                 pixels = np.bincount(found)
@@ -712,6 +713,8 @@ class Scene(Pictured):
 
     def _with_names(self, graph: SupportGraph) -> SupportGraph:
         """The graph with the name of each object that most pixels of its masks have."""
+        if not self._names:
+            return graph
         names = {id_: max(votes, key=votes.__getitem__) for id_, votes in self._names.items()}
         return replace(graph, objects=tuple(replace(o, name=names.get(o.id)) for o in graph.objects))
 
