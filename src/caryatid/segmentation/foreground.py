@@ -76,7 +76,10 @@ def find_foreground(view: View, surfaces: Sequence[SupportSurface], config: Conf
     inner = np.zeros(body.shape, dtype=np.bool_)
     inner[1:-1, 1:-1] = True
     cut = share(~inner.ravel()[rows]) > 0.0
-    unfit = (stands_on > 0) & ((meeting < TOUCHING) | (share(near) < 0.5) | cut)
+    # Noise of a far floor makes many small bodies.
+    area = np.bincount(index, (step * depth.ravel()[rows]) ** 2, len(names)) / (view.K[0, 0] * view.K[1, 1])
+    small = area < settings.min_area
+    unfit = (stands_on > 0) & ((meeting < TOUCHING) | (share(near) < 0.5) | cut | small)
     height = np.select(
         [stands_on[index] == k for k in range(len(surfaces))], [s.height(points) for s in surfaces]
     )
@@ -138,6 +141,7 @@ def find_furniture(
     furniture = np.zeros(count, dtype=np.bool_)
     for surface in surfaces:
         outline = shapely.Polygon(surface.outline_world[:, :2])
+        shapely.prepare(outline)
         away = shapely.distance(places, outline.exterior)
         within = surface.region.grown(margin).holds(points_world)
         # Something on the surface may hide a corner of it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from caryatid.geometry import polygons, transforms
 from caryatid.geometry.polygons import hull
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import SHARES, for_each, kernel
+from caryatid.runtime.parallel import SHARES, for_each, inner, kernel
 from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, View
 
 Mask = NDArray[np.bool_]
@@ -85,11 +86,7 @@ class Region:
 
     def holds(self, places: Array) -> Mask:
         """Whether places (N, 2) [m], or the x and y of points (N, 3), are in it."""
-        index = np.floor(places[:, :2] / self.size).astype(np.intp) - self.corner
-        inside = ((index >= 0) & (index < self.squares.shape)).all(axis=1)
-        held = np.zeros(len(index), dtype=np.bool_)
-        held[inside] = self.squares[tuple(index[inside].T)]
-        return held
+        return _held(places, self.corner, self.squares, self.size)
 
     def places(self) -> Array:
         """Centres (N, 2) of its squares [m]."""
@@ -102,21 +99,16 @@ class Region:
 
     def grown(self, margin: float) -> Region:
         """The region and the squares within a margin [m] of it; if negative, without a border as wide."""
-        if margin < 0.0:
-            depth = ndimage.distance_transform_edt(np.pad(self.squares, 1))[1:-1, 1:-1]
-            return replace(self, squares=depth * self.size > self.size / 2.0 - margin)
-        border = min(int(np.ceil(margin / self.size)), WIDEST)
-        squares = np.pad(self.squares, border)
-        if border:
-            squares = ndimage.distance_transform_edt(~squares) <= margin / self.size
-        return Region(self.corner - border, squares, self.size)
+        return _grown(self, margin)
 
     def filled(self) -> Region:
         """The squares within the convex hull of the region: what stands on a surface hides it."""
         corners = hull(np.argwhere(self.squares).astype(np.float64))
         if len(corners) < 3:
             return self
-        inside = shapely.contains_xy(shapely.Polygon(corners), *np.indices(self.squares.shape))
+        polygon = shapely.Polygon(corners)
+        shapely.prepare(polygon)
+        inside = shapely.contains_xy(polygon, *np.indices(self.squares.shape))
         return replace(self, squares=self.squares | inside)
 
     def trimmed(self) -> Region:
@@ -175,10 +167,9 @@ class SupportSurface:
 
         Their height is between low and high [m].
         """
-        height = self.height(points_world)
-        over = (low < height) & (height < high)
-        over[over] = self.region.grown(margin).holds(points_world[over])
-        return over
+        own = self.region.grown(margin)
+        grid = own.corner, own.squares, own.size
+        return _over(points_world, self.normal_world, self.point_world, low, high, *grid)
 
     def pixels_over(
         self, view: View, low: float, high: float, margin: float = np.inf, *, core: bool = False
@@ -386,6 +377,7 @@ def find_surface_below(surfaces: Sequence[SupportSurface], points_world: Array) 
     for k, surface in enumerate(surfaces):
         height = surface.height(points_world)
         outline = shapely.Polygon(surface.outline_world[:, :2]).buffer(BESIDE)
+        shapely.prepare(outline)
         nearer = (height > -BESIDE) & (height < least) & shapely.contains_xy(outline, points_world[:, :2])
         least[nearer], below[nearer] = height[nearer], k
     return below
@@ -582,6 +574,47 @@ def _basis(normal: Array) -> Array:
     """Two unit vectors (2, 3) that span the plane, right-handed with the normal."""
     x = transforms.perpendicular(normal)
     return np.stack([x, np.cross(normal, x)])
+
+
+@lru_cache(maxsize=16)  # a view asks for the same ones several times
+def _grown(region: Region, margin: float) -> Region:
+    """See `Region.grown`."""
+    squares, size = region.squares, region.size
+    if margin < 0.0:
+        depth = ndimage.distance_transform_edt(np.pad(squares, 1))[1:-1, 1:-1]
+        return replace(region, squares=depth * size > size / 2.0 - margin)
+    border = min(int(np.ceil(margin / size)), WIDEST)
+    squares = np.pad(squares, border)
+    if border:
+        squares = ndimage.distance_transform_edt(~squares) <= margin / size
+    return Region(region.corner - border, squares, size)
+
+
+@inner
+def _is_held(x, y, corner, squares, size):  # type: ignore[no-untyped-def]
+    """Whether a place is in a square."""
+    i, j = int(np.floor(x / size)) - corner[0], int(np.floor(y / size)) - corner[1]
+    return 0 <= i < squares.shape[0] and 0 <= j < squares.shape[1] and squares[i, j]
+
+
+@kernel
+def _held(places, corner, squares, size):  # type: ignore[no-untyped-def]
+    """See `Region.holds`."""
+    held = np.zeros(len(places), np.bool_)
+    for k in range(len(places)):
+        held[k] = _is_held(places[k, 0], places[k, 1], corner, squares, size)
+    return held
+
+
+@kernel
+def _over(points, normal, origin, low, high, corner, squares, size):  # type: ignore[no-untyped-def]
+    """See `SupportSurface.over`."""
+    over = np.zeros(len(points), np.bool_)
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        height = (x - origin[0]) * normal[0] + (y - origin[1]) * normal[1] + (z - origin[2]) * normal[2]
+        over[k] = low < height < high and _is_held(x, y, corner, squares, size)
+    return over
 
 
 @kernel
