@@ -145,11 +145,11 @@ class Goal:
         """The newest view that the camera took while it stood still, with its transform; or an error."""
         first: InputError | None = None
         try:
-            for depth, info, colour in self.inbox.views(since, self._settings.slop):
+            for depth, info, others in self.inbox.views(since, self._settings.slop):
                 found = self._still(depth.header)
                 if not isinstance(found, InputError):
                     self._frame = depth.header.frame_id
-                    return depth, info, colour, found
+                    return depth, info, others, found
                 first = first or found
         except InputError as error:
             first = first or error
