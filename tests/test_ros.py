@@ -235,7 +235,8 @@ def test_boxes_are_masks_of_what_they_hold_in_either_frame(views):
             bbox = SimpleNamespace(center=pose, size=size)
             detections.append(SimpleNamespace(results=results, bbox=bbox))
         header = SimpleNamespace(frame_id=frame)
-        masked[frame] = messages.with_masks(view, SimpleNamespace(header=header, detections=detections), frames)
+        boxes = SimpleNamespace(header=header, detections=detections)
+        masked[frame] = messages.with_masks(view, boxes, frames)
     np.testing.assert_array_equal(masked["map"].labels, masked["lens"].labels)
     assert masked["map"].names == {1: "near"}
     points = transforms.transform(view.pose, view.points_camera) - middle

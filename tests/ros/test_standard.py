@@ -155,7 +155,7 @@ def boxes(client):
 def test_boxes_with_names_go_in_and_detections_with_names_come_out(start_node, client, boxes):
     start_node(masks="boxes:/boxes")
     status, result = client.explore(max_views=2).result()
-    assert (status, result.views) == (GoalStatus.STATUS_SUCCEEDED, 2)
+    assert (status, result.views) == (GoalStatus.STATUS_SUCCEEDED, 2), result.message
     found = {o.id: o for o in result.graph.objects if o.role == "object"}
     assert sorted(o.name for o in found.values()) == sorted(boxes)
     detections = wait_for(lambda: client.detections)[-1]

@@ -108,6 +108,7 @@ def test_a_leaf_fails_when_the_server_goes(start_node, client):
     node = start_node()
     leaf = leaves.Explore(client.action, lambda decision: None)
     wait_for(lambda: "ready: " in node.text, 60.0)
+    assert client.action.wait_for_server(20.0)
     leaf.tick_once()
     at_stage(client, "waiting for the camera")
     node.stop()

@@ -162,7 +162,7 @@ def _pinhole(info: Any, rectified: bool) -> Array:
 
 def pose_message(make: Make, T: Array) -> Any:
     """A geometry_msgs/Pose of a matrix (4, 4)."""
-    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist()
     orientation = make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
     return make("geometry_msgs/msg/Pose", position=_point(make, T[:3, 3]), orientation=orientation)
 
