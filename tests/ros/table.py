@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import time
+from array import array
 from contextlib import suppress
 
 import numpy as np
@@ -136,7 +137,7 @@ class Table(Node):
                 message.header = self._image(depth, "", now.nanoseconds).header
                 file = io.BytesIO()
                 PIL.Image.fromarray(np.round(depth * 1000.0).astype(np.uint16)).save(file, "png")
-                message.data = bytes(12) + file.getvalue()  # after the header of its transport
+                message.data = array("B", bytes(12) + file.getvalue())  # after the header of its transport
                 self._packed_topic.publish(message)
         if "colour" in topics:
             late = int(self._value("offset") * 1e9)
@@ -161,7 +162,7 @@ class Table(Node):
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
         message.header.frame_id = self._value("frame")
         message.step = pixels.strides[0]
-        message.data = pixels.tobytes()
+        message.data = array("B", pixels.tobytes())  # of bytes, each is checked
         return message
 
 
