@@ -49,7 +49,7 @@ BASE, NAME, ARRAY = 1, 2, 3
 KINDS = {"string": str, "bool": bool, "float32": float, "float64": float}
 
 
-def make(name, **given):
+def make(name, /, **given):
     """A message as rosidl makes it: it refuses unknown fields and wrong types, and others have defaults."""
     package, _, *names = name.split("/")
     kind = STORE.types[f"{package}/msg/{'_'.join(names)}"]
@@ -208,6 +208,45 @@ def test_the_camera_info_must_be_that_of_a_pinhole(views):
             taken(**wrong)
 
 
+@pytest.mark.parametrize(
+    ("encoding", "kind"), [("mono8", "u1"), ("16UC1", "<u2"), ("32SC1", "<i4"), ("mono16", ">u2")]
+)
+def test_label_images_are_masks(views, encoding, kind):
+    message = image(views[0].labels.astype(kind), encoding, padding=4)
+    message.is_bigendian = int(kind[0] == ">")
+    masked = messages.with_masks(replace(views[0], labels=None), message, {})
+    np.testing.assert_array_equal(masked.labels, views[0].labels)
+    assert masked.labels_are == "segments"
+    with pytest.raises(InputError, match="masks: have the encoding 'rgb8'"):
+        messages.with_masks(views[0], image(views[0].rgb, "rgb8"), {})
+
+
+def test_boxes_are_masks_of_what_they_hold_in_either_frame(views):
+    view, middle = replace(views[0], labels=None), np.array([0.0, 0.0, 0.7])
+    to_camera = transforms.invert(view.pose)
+    frames = {"map": np.eye(4), "lens": view.pose}
+    masked = {}
+    for frame, T in (("map", np.eye(4)), ("lens", to_camera)):
+        detections = []
+        for name, (x, y, z) in {"near": (0.0, 0.0, 0.0), "far": (0.3, 0.0, 0.0)}.items():
+            pose = messages.pose_message(make, T @ transforms.rigid(np.eye(3), np.array([x, y, z]) + middle))
+            size = make("geometry_msgs/msg/Vector3", x=0.2, y=0.2, z=0.2)
+            results = [SimpleNamespace(hypothesis=SimpleNamespace(class_id=name))] if name == "near" else []
+            bbox = SimpleNamespace(center=pose, size=size)
+            detections.append(SimpleNamespace(results=results, bbox=bbox))
+        header = SimpleNamespace(frame_id=frame)
+        boxes = SimpleNamespace(header=header, detections=detections)
+        masked[frame] = messages.with_masks(view, boxes, frames)
+    np.testing.assert_array_equal(masked["map"].labels, masked["lens"].labels)
+    assert masked["map"].names == {1: "near"}
+    points = transforms.transform(view.pose, view.points_camera) - middle
+    inside = view.valid & (np.abs(points) <= 0.1 + messages.BOX_MARGIN).all(axis=-1)
+    np.testing.assert_array_equal(masked["map"].labels == 1, inside)
+    header = SimpleNamespace(frame_id="odom")
+    with pytest.raises(InputError, match="masks: have the frame 'odom'; publish them in map or lens"):
+        messages.with_masks(view, SimpleNamespace(header=header, detections=[]), frames)
+
+
 TOPICS = {"depth": "/depth", "info": "/info", "colour": "/colour"}
 
 
@@ -225,7 +264,7 @@ def arrived(depths, colours, **frames):
 
 def test_images_are_matched_by_their_stamps():
     inbox = arrived([1.0, 2.0, 3.0, 4.0], [1.99, 0.5, 3.01])
-    found = [[seconds_of(m.header.stamp) for m in (d, c)] for d, _, c in inbox.views(1.5, 0.02)]
+    found = [[seconds_of(m.header.stamp) for m in (d, o["colour"])] for d, _, o in inbox.views(1.5, 0.02)]
     np.testing.assert_allclose(found, [[3.0, 3.01], [2.0, 1.99]])
 
 

@@ -11,15 +11,19 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import subprocess
 import sys
 import sysconfig
+import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 TESTS = ROOT / "tests/ros"
 RUN = (
     "rclpy", "rmw-fastrtps-cpp", "std-msgs", "geometry-msgs", "sensor-msgs", "visualization-msgs",
+    "shape-msgs", "std-srvs", "trajectory-msgs",
 )  # fmt: skip
 """Wheels that the node and its tests import."""
 BUILD = (
@@ -29,6 +33,28 @@ BUILD = (
     "ament-package", "domain-coordinator", "gmock-vendor", "gtest-vendor", "python-cmake-module",
 )  # fmt: skip
 """Wheels that building messages needs; those above do not name them all."""
+CMAKE = """cmake_minimum_required(VERSION 3.8)
+project({name})
+find_package(ament_cmake REQUIRED)
+find_package(rosidl_default_generators REQUIRED)
+foreach(needed {needed})
+  find_package(${{needed}} REQUIRED)
+endforeach()
+rosidl_generate_interfaces(${{PROJECT_NAME}} {interfaces} DEPENDENCIES {needed})
+ament_export_dependencies(rosidl_default_runtime)
+ament_package()
+"""
+PACKAGE = """<package format="3">
+  <name>{name}</name>
+  <version>0.0.0</version>
+  <description>Messages for tests.</description>
+  <maintainer email="maintainers@caryatid.example">the caryatid authors</maintainer>
+  <license>BSD-3-Clause</license>
+  <member_of_group>rosidl_interface_packages</member_of_group>
+  <export><build_type>ament_cmake</build_type></export>
+</package>
+"""
+"""Files of a package of messages that no wheel has."""
 
 
 def main(folder: Path = ROOT / ".ros") -> None:
@@ -37,9 +63,9 @@ def main(folder: Path = ROOT / ".ros") -> None:
     Raises:
         SystemExit: A wheel, or a tool that builds, is missing.
     """
-    messages = [ROOT / "ros/caryatid_msgs", *sorted((TESTS / "interfaces").iterdir())]
-    wanted = hashlib.sha256(sys.version.encode() + Path(__file__).read_bytes())
-    for file in sorted(file for package in messages for file in package.rglob("*") if file.is_file()):
+    own, missing = ROOT / "ros/caryatid_msgs", TESTS / "interfaces.toml"
+    wanted = hashlib.sha256(sys.version.encode())
+    for file in (Path(__file__), missing, *sorted(file for file in own.rglob("*") if file.is_file())):
         wanted.update(file.read_bytes())
     stamp = folder / "stamp"
     if stamp.exists() and stamp.read_text() == wanted.hexdigest():
@@ -68,7 +94,8 @@ def main(folder: Path = ROOT / ".ros") -> None:
         "LD_LIBRARY_PATH": libraries,
         "PYTHONPATH": str(site),
     }
-    for package in messages:
+    packages = tomllib.loads(missing.read_text()).items()
+    for package in (own, *(_write_package(folder / "source" / name, files) for name, files in packages)):
         build = folder / "build" / package.name
         options = [f"-DCMAKE_INSTALL_PREFIX={folder}", "-DCMAKE_BUILD_TYPE=Debug", "-DBUILD_TESTING=OFF"]
         options += ["-DCMAKE_CXX_FLAGS=-O0", f"-DPython3_EXECUTABLE={python}", "-Wno-dev", "-G", "Ninja"]
@@ -78,6 +105,20 @@ def main(folder: Path = ROOT / ".ros") -> None:
     paths = [ROOT / "src", ROOT / "ros/caryatid_ros", TESTS / "stand_ins", sysconfig.get_path("purelib")]
     (site / "zz_caryatid.pth").write_text("".join(f"{path}\n" for path in paths))
     stamp.write_text(wanted.hexdigest())
+
+
+def _write_package(folder: Path, interfaces: Mapping[str, str]) -> Path:
+    """Write a package of messages."""
+    names = {name for fields in interfaces.values() for name in re.findall(r"(\w+)/\w", fields)}
+    texts = {"name": folder.name, "needed": " ".join(sorted(names - {folder.name}))}
+    files = {
+        "CMakeLists.txt": CMAKE.format(interfaces=" ".join(interfaces), **texts),
+        "package.xml": PACKAGE.format(**texts),
+    }
+    for name, text in (files | dict(interfaces)).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
 
 
 def _run(*command: object, environment: dict[str, str] | None = None) -> None:

@@ -17,9 +17,11 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 from table import DEFAULTS
+from vision_msgs.msg import Detection3DArray
 
-SERVICES = {"order": Order, "refused": Refused, "removed": Removed}
+SERVICES = {"order": Order, "refused": Refused, "removed": Removed, "go_home": Trigger}
 
 
 class Goal:
@@ -58,7 +60,7 @@ class Client(Node):
     """Clients of all that the node offers; a context manager that spins meanwhile.
 
     Attributes:
-        graphs, decisions, logs, stages: What was published so far.
+        graphs, decisions, logs, stages, detections: What was published so far.
         action, service_clients: The clients of rclpy.
     """
 
@@ -73,6 +75,8 @@ class Client(Node):
         self.create_subscription(Decision, "/decision", self.decisions.append, 10)
         self.create_subscription(Log, "/rosout", self.logs.append, 100)
         self.create_subscription(String, "/stage", lambda m: self.stages.append(m.data), latched)
+        self.detections: list[Detection3DArray] = []
+        self.create_subscription(Detection3DArray, "/detections", self.detections.append, latched)
         self.action = ActionClient(self, Explore, "/explore")
         self.service_clients = {name: self.create_client(kind, f"/{name}") for name, kind in SERVICES.items()}
         self._setters: dict[str, Any] = {}

@@ -33,10 +33,9 @@ class Process:
     """
 
     def __init__(self, *arguments: object, **parameters: object) -> None:
-        given = [f"-p {name}:={_yaml(value)}" for name, value in parameters.items()]
-        command = [sys.executable, *map(str, arguments)]
-        if given:
-            command += ["--ros-args", *" ".join(given).split()]
+        command = [sys.executable, *map(str, arguments), *(["--ros-args"] if parameters else [])]
+        for name, value in parameters.items():
+            command += ["-p", f"{name}:={_yaml(value)}"]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ
         )
@@ -66,7 +65,7 @@ class Process:
 
 
 def _yaml(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value).replace(" ", "")
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def wait_for(condition, seconds: float = 10.0, what: str = "it"):
@@ -148,8 +147,9 @@ def client():
 
 @pytest.fixture(autouse=True)
 def defaults(client, table):
-    """The table as it is by default."""
+    """The table as it is by default, with its camera where it was first."""
     client.set_table()
+    client.call("go_home")
 
 
 @pytest.hookimpl(wrapper=True)

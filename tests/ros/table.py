@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import time
+from array import array
 from contextlib import suppress
 
 import numpy as np
@@ -22,6 +23,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation, Slerp
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from caryatid.benchmark.episodes import open_scene
@@ -36,7 +38,7 @@ DEFAULTS = {
     "follow": True,  # whether the camera moves to decisions
     "motion_time": 0.3,  # of a motion [s]
     "encoding": "32FC1",  # of depth
-    "topics": ["depth", "colour", "info", "tf"],  # what is published
+    "topics": ["depth", "colour", "info", "tf"],  # what is published; also labels
     "frame": "camera_optical",
     "world": "map",
     "offset": 0.0,  # stamp of colour minus stamp of depth [s]
@@ -60,6 +62,7 @@ class Table(Node):
         scene, _ = open_scene(self._value("scene"))
         simulation = make_simulation(scene, config, noise="none", seed=0)
         self.camera, self.pose = simulation.camera, simulation.robot.T_world_camera
+        self._home = self.pose
         self._way: tuple[float, np.ndarray, np.ndarray] | None = None
         self._drawn: tuple[bytes, tuple] | None = None
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -67,12 +70,14 @@ class Table(Node):
         self._colour_topic = self.create_publisher(Image, "/camera/colour", qos_profile_sensor_data)
         packed = CompressedImage, "/camera/depth/compressedDepth", qos_profile_sensor_data
         self._packed_topic = self.create_publisher(*packed)
+        self._labels_topic = self.create_publisher(Image, "/camera/labels", qos_profile_sensor_data)
         self._info_topic = self.create_publisher(CameraInfo, "/camera/info", qos_profile_sensor_data)
         self._tf_topic = self.create_publisher(TFMessage, "/tf", 100)
         self._static_topic = self.create_publisher(TFMessage, "/tf_static", latched)
         self._clock_topic = self.create_publisher(Clock, "/clock", 10)
         self.create_subscription(Decision, "/decision", self._decide, 10)
         self.create_subscription(PoseStamped, "/table/go", lambda message: self._go(message.pose), 10)
+        self.create_service(Trigger, "/go_home", self._go_home)
         self.create_timer(1.0 / self._value("rate"), self._publish)
         self.create_timer(0.01, self._move)
 
@@ -89,6 +94,10 @@ class Table(Node):
         end[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
         end[:3, 3] = p.x, p.y, p.z
         self._way = time.monotonic(), self.pose, end
+
+    def _go_home(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.pose, self._way, response.success = self._home, None, True
+        return response
 
     def _move(self) -> None:
         if self._way is not None:
@@ -118,8 +127,8 @@ class Table(Node):
             depth = view.depth
             if self._value("encoding") == "16UC1":
                 depth = np.round(depth * 1000.0).astype(np.uint16)
-            self._drawn = self.pose.tobytes(), (depth, view.rgb, view.K)
-        depth, rgb, K = self._drawn[1]
+            self._drawn = self.pose.tobytes(), (depth, view.rgb, view.K, view.labels)
+        depth, rgb, K, labels = self._drawn[1]
         topics, now = self._value("topics"), self.get_clock().now()
         if "depth" in topics:
             self._depth_topic.publish(self._image(depth, self._value("encoding"), now.nanoseconds))
@@ -128,11 +137,13 @@ class Table(Node):
                 message.header = self._image(depth, "", now.nanoseconds).header
                 file = io.BytesIO()
                 PIL.Image.fromarray(np.round(depth * 1000.0).astype(np.uint16)).save(file, "png")
-                message.data = bytes(12) + file.getvalue()  # after the header of its transport
+                message.data = array("B", bytes(12) + file.getvalue())  # after the header of its transport
                 self._packed_topic.publish(message)
         if "colour" in topics:
             late = int(self._value("offset") * 1e9)
             self._colour_topic.publish(self._image(rgb, "rgb8", now.nanoseconds + late))
+        if "labels" in topics:
+            self._labels_topic.publish(self._image(labels.astype(np.int32), "32SC1", now.nanoseconds))
         if "info" in topics:
             info = CameraInfo(height=depth.shape[0], width=depth.shape[1], distortion_model="plumb_bob")
             info.header.stamp, info.header.frame_id = now.to_msg(), self._value("frame")
@@ -151,7 +162,7 @@ class Table(Node):
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
         message.header.frame_id = self._value("frame")
         message.step = pixels.strides[0]
-        message.data = pixels.tobytes()
+        message.data = array("B", pixels.tobytes())  # of bytes, each is checked
         return message
 
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from caryatid.config.settings import read_settings
 from caryatid.errors import InputError, NoSurfaceError
 from caryatid.exploration import Explorer
+from caryatid.graph import SceneObject
 from caryatid.io.mask_sources import mask_source, without_ignored
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.planners import make_planner
@@ -32,6 +36,7 @@ class Exploration:
         settings: The node's parameters.
         publish: Called with the name of a topic and a message.
         make: Makes a message.
+        planning_scene: Shows the graph, and an object that was lifted, to a motion planner.
 
     Attributes:
         scene: The newest scene; it is replaced, and never changes, so that other threads may read it.
@@ -43,12 +48,18 @@ class Exploration:
     """
 
     def __init__(
-        self, settings: Settings, publish: Callable[[str, Any], None], make: Make = make_message
+        self,
+        settings: Settings,
+        publish: Callable[[str, Any], None],
+        make: Make = make_message,
+        planning_scene: Any = None,
     ) -> None:
         self._settings, self._publish, self._make = settings, publish, make
         self._config = read_settings(Path(settings.config) if settings.config else None, [])
         self.max_views = self._config.active.max_views
-        self._masks = mask_source(settings.masks, self._config, settings.seed) if settings.masks else None
+        self._planning_scene = planning_scene
+        own = settings.masks and "masks" not in settings.topics
+        self._masks = mask_source(settings.masks, self._config, settings.seed) if own else None
         self._robot = CarriedCamera(find_robot(settings.robot))
         make_planner(settings.planner)
         self._session = self._opened() if settings.session else None
@@ -97,17 +108,22 @@ class Exploration:
         self._replace(explorer.scene)
         return self.graph
 
-    def look(self, depth: Any, info: Any, colour: Any, transform: Any) -> Any:
-        """Add a view with the transform of its camera; publish and return the graph.
+    def look(self, depth: Any, info: Any, others: Mapping[str, Any], transform: Any) -> Any:
+        """Add a view of a depth image with its camera info, `colour` and `masks`, and transform.
+
+        The graph is published and returned.
 
         Raises:
             CaryatidError: The view cannot be used. Without a table, it is kept until another one shows it.
         """
         T_world_camera = messages.matrix_of(transform.rotation, transform.translation, "camera")
         rectified = self._settings.rectified or "rect" in self._settings.depth_topic.rpartition("/")[2]
-        view = messages.view_of(depth, info, colour, T_world_camera, rectified=rectified)
+        view = messages.view_of(depth, info, others.get("colour"), T_world_camera, rectified=rectified)
         if self._settings.ignore:
             view = without_ignored(view, Path(self._settings.ignore), self._config.recording.max_pixels)
+        if "masks" in others:
+            frames = {self._settings.world_frame: np.eye(4), depth.header.frame_id: T_world_camera}
+            view = messages.with_masks(view, others["masks"], frames)
         view = view if self._masks is None else self._masks(view)
         explorer, scene, step, failure = self._explorer, self.scene.copy(), self._explorer.step, None
         explorer.scene, self._robot.scene, self._robot.T_world_camera = scene, scene, T_world_camera
@@ -132,12 +148,16 @@ class Exploration:
         log.info("view %s added: %s", view.name, scene)
         return self.graph
 
-    def publish(self) -> None:
-        """Publish the graph and its markers."""
+    def publish(self, lifted: SceneObject | None = None) -> None:
+        """Publish the graph, in all its forms, and an object that was lifted."""
         scene = self.scene
         self.graph = messages.graph_message(self._make, scene.graph, scene.new_changes, self.header)
         self._publish("support_graph", self.graph)
         self._publish("markers", messages.markers_message(self._make, scene.graph, self.header))
+        if find_spec("vision_msgs") is not None:
+            self._publish("detections", messages.detections_message(self._make, scene.graph, self.header))
+        if self._planning_scene is not None:
+            self._planning_scene.show(scene.graph, lifted)
 
     def plan(self, refusal: str) -> tuple[Any, str | None]:
         """Plan the next view, or another one if that was refused: its Decision, or why there is none."""
@@ -149,7 +169,7 @@ class Exploration:
 
     def remove(self, request: Any, response: Any) -> None:
         """Report that an object was removed or moved, publish the graph, and fill in a Removed response."""
-        motion, T, scene = request.motion, None, self._known().copy()
+        motion, T, scene, before = request.motion, None, self._known().copy(), self.scene.graph
         if request.moved:
             T = messages.matrix_of(motion.rotation, motion.translation, "motion")
         if self._session is not None:
@@ -160,7 +180,7 @@ class Exploration:
         else:
             scene.moved(request.object, T)
         self._replace(scene)
-        self.publish()
+        self.publish(None if request.moved else before[request.object])
         response.graph = self.graph
 
     def order(self, request: Any, response: Any) -> None:

@@ -43,7 +43,8 @@ class Goal:
         self._node, self._handle, self.inbox, self._buffer = node, handle, inbox, buffer
         self._settings, self._views, self._lock = read_parameters(node), 0, Lock()
         self._end, self._awaited, self._refusal = "", False, ""
-        self._watched, self._acknowledged, self._beat = False, time.monotonic(), 0.0
+        self._watched, self._told, self._beat = False, False, 0.0
+        self._acknowledged: float | None = None
         topic, qos = "explore/_action/status", qos_profile_action_status_default
         self._status = node.create_publisher(GoalStatusArray, topic, qos)
 
@@ -145,11 +146,11 @@ class Goal:
         """The newest view that the camera took while it stood still, with its transform; or an error."""
         first: InputError | None = None
         try:
-            for depth, info, colour in self.inbox.views(since, self._settings.slop):
+            for depth, info, others in self.inbox.views(since, self._settings.slop):
                 found = self._still(depth.header)
                 if not isinstance(found, InputError):
                     self._frame = depth.header.frame_id
-                    return depth, info, colour, found
+                    return depth, info, others, found
                 first = first or found
         except InputError as error:
             first = first or error
@@ -234,17 +235,20 @@ class Goal:
     def _is_client_there(self) -> bool:
         """Whether the client receives messages of the goal's status, which are repeated for this purpose.
 
-        DDS notices only after 20 s that a process was killed.
+        DDS notices only after 20 s that a process was killed. If none was ever acknowledged, it waits for one
+        that was killed before this goal.
         """
         now, watched = time.monotonic(), self._watched
         if now - self._beat < BEAT:
             return True
         self._beat, self._watched = now, self._node.count_subscribers("explore/_action/feedback") > 0
         if self._status.wait_for_all_acked(Duration(seconds=0.01)):
-            self._acknowledged, info = now, GoalInfo(goal_id=self._handle.goal_id)
+            self._acknowledged, info = now if self._told else None, GoalInfo(goal_id=self._handle.goal_id)
             status = GoalStatus(goal_info=info, status=self._handle.status)
             self._status.publish(GoalStatusArray(status_list=[status]))
-        return now - self._acknowledged < SILENT and (self._watched or not watched)
+            self._told = True
+        is_silent = self._acknowledged is not None and now - self._acknowledged >= SILENT
+        return not is_silent and (self._watched or not watched)
 
 
 def _between(p: Any, q: Any, p2: Any, q2: Any) -> tuple[float, float]:

@@ -5,7 +5,8 @@ Messages are made by a function `make(name, **fields)`, so that other message ty
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import reduce
 from importlib import import_module
 from typing import Any
@@ -33,15 +34,39 @@ CUBE, SPHERE, CYLINDER, ARROW, TEXT, TRIANGLES, DELETE_ALL = 1, 2, 3, 0, 9, 11, 
 """Types of visualization_msgs/Marker, and its action that deletes all markers."""
 SHAPES = {"box": CUBE, "sphere": SPHERE, "cylinder": CYLINDER}
 """Kinds of shapes that RViz draws itself; others are drawn as triangles."""
+LABELS = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2", "32SC1": "i4"}
+"""Encodings of label images, and NumPy's type of their pixels."""
+BOX_MARGIN = 0.005
+"""How far outside a box its readings may lie [m]: they are on its faces, with noise."""
 TEXT_HEIGHT, ARROW_WIDTH = 0.025, 0.012
 """Height of names, and width of the arrow of a certain support [m]."""
 
 
-def make_message(name: str, **fields: Any) -> Any:
+def make_message(name: str, /, **fields: Any) -> Any:
     """Make a message of an installed ROS package, such as `caryatid_msgs/srv/Order/Request`."""
+    return message_type(name)(**fields)
+
+
+def message_type(name: str) -> Any:
+    """Return the type of a message of an installed ROS package."""
     package, kind, *names = name.split("/")
-    found: Any = reduce(getattr, names, import_module(f"{package}.{kind}"))
-    return found(**fields)
+    return reduce(getattr, names, import_module(f"{package}.{kind}"))
+
+
+def message_of(make: Make, name: str, fields: Mapping[str, Any]) -> Any:
+    """A message of nested mappings, as JSON has them; what they do not name has its default."""
+    message = make(name)
+    kinds = message.get_fields_and_field_types()
+    for field, value in fields.items():
+        kind = kinds[field].removeprefix("sequence<").removesuffix(">").replace("/", "/msg/")
+        if isinstance(value, Mapping):
+            value = message_of(make, kind, value)
+        elif "/" in kind:
+            value = [message_of(make, kind, item) for item in value]
+        elif kind == "octet":
+            value = bytes([value])
+        setattr(message, field, value)
+    return message
 
 
 def matrix_of(rotation: Any, translation: Any, name: str) -> Array:
@@ -81,6 +106,43 @@ def view_of(depth: Any, info: Any, colour: Any, T_world_camera: Array, *, rectif
     return View(metres, _pinhole(info, rectified), T_world_camera, image, name=name)
 
 
+def with_masks(view: View, masks: Any, frames: Mapping[str, Array]) -> View:
+    """Return a view with masks, as segments of that view alone.
+
+    Args:
+        view: The view.
+        masks: sensor_msgs/Image of labels, 0 where there is no object; or vision_msgs/Detection3DArray, of
+            which each box is the mask of what it holds, with the class of its first result as name.
+        frames: Pose (4, 4) in the world of each frame that detections may have.
+
+    Raises:
+        InputError: The masks have another size or encoding than possible, or their frame is unknown.
+    """
+    if hasattr(masks, "encoding"):
+        kind = LABELS.get(masks.encoding)
+        if kind is None:
+            reason = f"have the encoding '{masks.encoding}'"
+            raise InputError("masks", reason, f"publish them as {', '.join(LABELS)}")
+        pixels = np.frombuffer(masks.data, ">" + kind if masks.is_bigendian else kind)
+        labels = pixels.reshape(masks.height, -1)[:, : masks.width].astype(np.int32)
+        return replace(view, labels=labels, labels_are="segments", names=None)
+    if masks.header.frame_id not in frames:
+        reason = f"have the frame '{masks.header.frame_id}'"
+        raise InputError("masks", reason, f"publish them in {' or '.join(frames)}")
+    labels, names = np.zeros(view.depth.shape, dtype=np.int32), {}
+    inside = np.where(view.valid, 1.0, 0.0)  # 0 in the middle of a box, 1 on its faces
+    for label, detection in enumerate(masks.detections, start=1):
+        box, size = detection.bbox.center, detection.bbox.size
+        T = frames[masks.header.frame_id] @ matrix_of(box.orientation, box.position, "masks")
+        half = np.array([size.x, size.y, size.z]) / 2.0 + BOX_MARGIN
+        points = transforms.transform(transforms.invert(T) @ view.T_world_camera, view.points_camera)
+        share = np.abs(points / half).max(axis=-1)
+        labels[share < inside] = label
+        inside = np.minimum(inside, share)
+        names[label] = detection.results[0].hypothesis.class_id if detection.results else ""
+    return replace(view, labels=labels, labels_are="segments", names=names)
+
+
 def _pinhole(info: Any, rectified: bool) -> Array:
     """Camera matrix (3, 3) of whole, undistorted images."""
     if max(info.binning_x, info.binning_y) > 1:
@@ -100,7 +162,7 @@ def _pinhole(info: Any, rectified: bool) -> Array:
 
 def pose_message(make: Make, T: Array) -> Any:
     """A geometry_msgs/Pose of a matrix (4, 4)."""
-    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist()
     orientation = make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
     return make("geometry_msgs/msg/Pose", position=_point(make, T[:3, 3]), orientation=orientation)
 
@@ -118,7 +180,8 @@ def graph_message(make: Make, graph: SupportGraph, changes: Sequence[Change], he
 def _object(make: Make, o: SceneObject) -> Any:
     return make(
         "caryatid_msgs/msg/Object",
-        id=o.id, label=int(o.label), role=o.role, shape=o.shape.kind, occurrences=int(o.occurrences),
+        id=o.id, name=o.name or "", label=int(o.label), role=o.role, shape=o.shape.kind,
+        occurrences=int(o.occurrences),
         pose=pose_message(make, o.shape.T_world_object), extents=_vector(make, o.shape.extents),
         probability=float("nan") if o.probability is None else float(o.probability), doubt=o.doubt,
         triangles=_corners(make, o.shape) if o.shape.kind not in SHAPES else [],
@@ -136,6 +199,24 @@ def _support(make: Make, s: Support) -> Any:
 
 def _change(make: Make, c: Change) -> Any:
     return make("caryatid_msgs/msg/Change", kind=c.kind, object=c.object_id, view=c.view, why=c.why)
+
+
+def detections_message(make: Make, graph: SupportGraph, header: Any) -> Any:
+    """A vision_msgs/Detection3DArray of the objects: their class is their name, or else the kind of shape."""
+
+    def detection(o: SceneObject) -> Any:
+        kind, score = o.name or o.shape.kind, 1.0 if o.probability is None else float(o.probability)
+        pose = pose_message(make, o.shape.T_world_object)
+        result = make(
+            "vision_msgs/msg/ObjectHypothesisWithPose",
+            hypothesis=make("vision_msgs/msg/ObjectHypothesis", class_id=kind, score=score),
+            pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose),
+        )
+        box = make("vision_msgs/msg/BoundingBox3D", center=pose, size=_vector(make, o.shape.extents))
+        return make("vision_msgs/msg/Detection3D", header=header, id=o.id, results=[result], bbox=box)
+
+    found = [detection(o) for o in graph.objects if o.role == "object"]
+    return make("vision_msgs/msg/Detection3DArray", header=header, detections=found)
 
 
 def decision_message(make: Make, decision: Decision, header: Any) -> Any:

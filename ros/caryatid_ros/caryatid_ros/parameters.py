@@ -11,6 +11,9 @@ from caryatid.errors import InputError
 OTHERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 """Parameters, or their prefixes, that every node has."""
 
+MASKS = {"labels": "sensor_msgs/msg/Image", "boxes": "vision_msgs/msg/Detection3DArray"}
+"""Kinds of masks that are topics, and their messages."""
+
 
 def _given(default: Any, about: str, low: float = 0.0, high: float = 1e6) -> Any:
     return field(default=default, metadata={"about": about, "range": (low, high)})
@@ -31,10 +34,14 @@ class Settings:
     info_topic: str = _given("/camera/color/camera_info", "of these images")
     rectified: bool = _given(False, "whether the images are rectified; those of a topic …rect… are")
     config: str = _given("", "TOML file of caryatid's settings; empty = defaults")
-    masks: str = _given("", "source of masks, onnx:FILE; empty = automatic segmentation")
+    masks: str = _given(
+        "", "source of masks: onnx:FILE, labels:TOPIC or boxes:TOPIC; empty = automatic segmentation"
+    )
     ignore: str = _given("", "grey PNG, not 0 where the images show the robot itself; empty = nowhere")
     planner: str = _given("support", "planner of the next view")
     robot: str = _given("humanoid", "which views are reachable: humanoid, arm:FILE.npz or module:callable")
+    planning_scene: str = _given("", "topic of MoveIt's planning scene, /planning_scene; empty = none")
+    gripper_links: str = _given("", "links that touch what is `removed`, the first holds it; empty = none")
     session: str = _given("", "folder that keeps the scene over a restart; empty = none")
     seed: int = _given(0, "of every random choice", high=2**63 - 1)
     slop: float = _given(0.02, "maximum time between the images of a view [s]", 0.0, 1.0)
@@ -46,6 +53,20 @@ class Settings:
     angle_tolerance: float = _given(0.05, "maximum rotation from the next view on arrival [rad]", 0.0005, 3.2)
     max_speed: float = _given(0.02, "maximum speed of the camera while it takes a view [m/s]", 0.001)
     max_turn: float = _given(0.05, "maximum rotation of the camera meanwhile [rad/s]", 0.001)
+
+    @property
+    def topics(self) -> dict[str, tuple[str, str]]:
+        """What the node listens to: name and message type of each topic of images, camera info and masks."""
+        named = {"depth": self.depth_topic, "info": self.info_topic, "colour": self.colour_topic}
+        found = {what: (topic, _image_type(topic)) for what, topic in named.items() if topic}
+        found["info"] = self.info_topic, "sensor_msgs/msg/CameraInfo"
+        kind, _, topic = self.masks.partition(":")
+        return found | ({"masks": (topic, MASKS[kind])} if kind in MASKS else {})
+
+
+def _image_type(topic: str) -> str:
+    packed = topic.endswith(("/compressed", "/compressedDepth"))
+    return "sensor_msgs/msg/CompressedImage" if packed else "sensor_msgs/msg/Image"
 
 
 def declare_parameters(node: Any) -> None:

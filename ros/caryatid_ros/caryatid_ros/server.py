@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import traceback
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from threading import Thread
 from typing import Any
@@ -18,7 +19,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.task import Future
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 from tf2_ros import Buffer, TransformListener
 from visualization_msgs.msg import MarkerArray
@@ -26,10 +27,15 @@ from visualization_msgs.msg import MarkerArray
 from caryatid.errors import CaryatidError, InputError, in_one_line
 from caryatid_ros.goal import CANCELLED, Goal
 from caryatid_ros.inbox import Inbox
+from caryatid_ros.messages import make_message, message_type
 from caryatid_ros.parameters import declare_parameters, read_parameters
 
 PUBLISHED = {"support_graph": SupportGraph, "markers": MarkerArray, "stage": String, "decision": Decision}
 """Topics, relative to the node's namespace, and their types."""
+with suppress(ImportError):
+    from vision_msgs.msg import Detection3DArray
+
+    PUBLISHED["detections"] = Detection3DArray
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """How topics are published whose newest message those receive, too, who come late."""
 
@@ -53,9 +59,9 @@ class ExplorationNode(Node):
         super().__init__("caryatid")
         declare_parameters(self)
         self.settings = read_parameters(self)
-        given = {n: getattr(self.settings, f"{n}_topic") for n in ("depth", "info", "colour")}
         try:
-            self._listened = {n: self.resolve_topic_name(topic) for n, topic in given.items() if topic}
+            topics = self.settings.topics.items()
+            self._listened = {what: (self.resolve_topic_name(topic), kind) for what, (topic, kind) in topics}
         except RuntimeError as error:  # of the middleware
             raise InputError("parameters", " ".join(str(error).split()), "correct the topic") from None
         self.failure = ""
@@ -72,11 +78,13 @@ class ExplorationNode(Node):
         for name in ("caryatid", "caryatid_ros"):
             logging.getLogger(name).setLevel(logging.INFO)
             logging.getLogger(name).addHandler(handler)
+        self._planning_scene = self._made_planning_scene() if self.settings.planning_scene else None
         self.scene_thread = ThreadPoolExecutor(1)
         self.tell_stage("starting")
         self.prepared = self.scene_thread.submit(self._prepare)
         self._info: Any = None
-        self.create_subscription(CameraInfo, given["info"], self._take_info, qos_profile_sensor_data)
+        info = self._listened["info"][0]
+        self.create_subscription(CameraInfo, info, self._take_info, qos_profile_sensor_data)
         group = ReentrantCallbackGroup()
         order = partial(self._answer, ThreadPoolExecutor(1), "order")
         self.create_service(Order, "order", order, callback_group=group)
@@ -92,6 +100,21 @@ class ExplorationNode(Node):
         """Destroy the node and all that it offers, so that others know at once that it is gone."""
         self._server.destroy()
         super().destroy_node()
+
+    def _made_planning_scene(self) -> Any:
+        """The topic of MoveIt's planning scene.
+
+        Raises:
+            InputError: Messages of MoveIt are not installed.
+        """
+        try:
+            from caryatid_ros.planning_scene import PlanningSceneTopic
+        except ImportError as error:
+            remedy = "install moveit_msgs"
+            raise InputError(
+                "parameter planning_scene", f"needs MoveIt's messages ({error})", remedy
+            ) from None
+        return PlanningSceneTopic(self, self.settings, LATCHED, make_message)
 
     def publish(self, name: str, message: Any) -> None:
         """Publish a message under a name of PUBLISHED."""
@@ -119,7 +142,7 @@ class ExplorationNode(Node):
             from caryatid.simulation.warm_up import is_warm, warm_up
             from caryatid_ros.exploration import Exploration
 
-            exploration = Exploration(self.settings, self.publish)
+            exploration = Exploration(self.settings, self.publish, planning_scene=self._planning_scene)
             if not is_warm():
                 self.get_logger().info("compiling kernels, once after installation, for about a minute")
                 self.tell_stage("compiling kernels")
@@ -174,16 +197,17 @@ class ExplorationNode(Node):
 
     def _begin(self, handle: Any) -> None:
         """Listen to the camera for the new goal only, because images and transforms cost time."""
-        before, buffer, inbox = set(self.subscriptions), Buffer(), Inbox(self._listened, self._info)
+        before, buffer = set(self.subscriptions), Buffer()
+        inbox = Inbox({what: topic for what, (topic, _) in self._listened.items()}, self._info)
         self._listener = TransformListener(buffer, self)
-        for name, topic in self._listened.items():
-            packed = topic.endswith(("/compressed", "/compressedDepth"))
-            kind, put = CompressedImage if packed else Image, partial(inbox.put, name)
-            if name != "info":
-                self.create_subscription(kind, topic, put, qos_profile_sensor_data)
-        for publisher in self.get_publishers_info_by_topic(self._listened["info"]):
+        for what, (topic, kind) in self._listened.items():
+            if what != "info":
+                put = partial(inbox.put, what)
+                self.create_subscription(message_type(kind), topic, put, qos_profile_sensor_data)
+        info = self._listened["info"][0]
+        for publisher in self.get_publishers_info_by_topic(info):
             if publisher.qos_profile.durability == LATCHED.durability:  # it may have published before we came
-                self.create_subscription(CameraInfo, self._listened["info"], self._take_info, LATCHED)
+                self.create_subscription(CameraInfo, info, self._take_info, LATCHED)
         self.goal = Goal(self, handle, inbox, buffer)
         self._heard = set(self.subscriptions) - before
         handle.execute()

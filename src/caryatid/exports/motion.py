@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 from scipy.spatial.transform import Rotation
 
 from caryatid.geometry.shapes import Cylinder, Shape, Sphere
 from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SupportGraph
+from caryatid.graph import SceneObject, SupportGraph
 from caryatid.io.json_files import json_text
 from caryatid.viz.colours import rgba
 
 BOX, SPHERE, CYLINDER = 1, 2, 3
 """Types of shape_msgs/SolidPrimitive."""
-ADD: Final = 0
-"""Operation of moveit_msgs/CollisionObject that adds an object, or replaces the one of the same id."""
+ADD, REMOVE = 0, 1
+"""Operations of moveit_msgs/CollisionObject: add an object, or replace the one of the same id; remove it."""
 
 
 def planning_scene(
@@ -38,21 +38,22 @@ def planning_scene(
     Returns:
         A moveit_msgs/PlanningScene; what is not named has its default. `operation`, a byte, is a number.
     """
-    objects = [
-        {
-            "header": {"frame_id": frame},
-            "id": item.id,
-            "pose": _pose_message(item.shape.T_world_object),
-            **_geometry(item.shape),
-            "operation": ADD,
-        }
-        for item in graph.objects
-    ]
     return {
         "is_diff": True,
         "robot_state": {"is_diff": True},  # else MoveIt drops what the robot holds
-        "world": {"collision_objects": objects},
+        "world": {"collision_objects": [collision_object(item, frame) for item in graph.objects]},
     } | ({} if allowed is None else {"allowed_collision_matrix": _extended(allowed, graph)})
+
+
+def collision_object(item: SceneObject, frame: str) -> dict[str, Any]:
+    """A moveit_msgs/CollisionObject that adds an object."""
+    return {
+        "header": {"frame_id": frame},
+        "id": item.id,
+        "pose": _pose_message(item.shape.T_world_object),
+        **_geometry(item.shape),
+        "operation": ADD,
+    }
 
 
 def _extended(allowed: Mapping[str, Any], graph: SupportGraph) -> dict[str, Any]:

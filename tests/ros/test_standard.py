@@ -1,0 +1,181 @@
+"""Messages of other packages on real ROS 2: MoveIt's planning scene, and vision_msgs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from conftest import wait_for
+from moveit_msgs.msg import AllowedCollisionEntry, AllowedCollisionMatrix, CollisionObject, PlanningScene
+from moveit_msgs.srv import GetPlanningScene
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import Image
+from vision_msgs.msg import (
+    BoundingBox3D,
+    Detection3D,
+    Detection3DArray,
+    ObjectHypothesis,
+    ObjectHypothesisWithPose,
+)
+
+from caryatid.benchmark.episodes import open_scene
+from caryatid_ros.messages import make_message, pose_message
+
+GRIPPER = {"planning_scene": "/planning_scene", "gripper_links": "hand finger"}
+
+
+class Planner:
+    """A planner that keeps its planning scene as MoveIt does.
+
+    Attributes:
+        world: Objects by id.
+        held: Objects that are attached to a link, by id.
+        matrix: Allowed collisions.
+        scenes: Number of diffs it applied.
+    """
+
+    def __init__(self, node) -> None:
+        rows = [AllowedCollisionEntry(enabled=row) for row in ([False, True], [True, False])]
+        self.world, self.held, self.scenes = {}, {}, 0
+        self.matrix = AllowedCollisionMatrix(entry_names=["hand", "finger"], entry_values=rows)
+        self._node = node
+        self._service = node.create_service(GetPlanningScene, "/get_planning_scene", self._answer)
+        self._topic = node.create_subscription(PlanningScene, "/planning_scene", self._apply, 10)
+
+    def destroy(self) -> None:
+        """Stop."""
+        self._node.destroy_service(self._service)
+        self._node.destroy_subscription(self._topic)
+
+    @property
+    def touching(self) -> set[frozenset[str]]:
+        """The pairs that may touch."""
+        names, rows = self.matrix.entry_names, self.matrix.entry_values
+        pairs = zip(names, rows, strict=True)
+        return {frozenset((a, b)) for a, row in pairs for b, on in zip(names, row.enabled, strict=True) if on}
+
+    def _answer(self, request, response):
+        response.scene.allowed_collision_matrix = self.matrix
+        return response
+
+    def _apply(self, scene) -> None:
+        assert scene.is_diff
+        assert scene.robot_state.is_diff
+        for body in scene.robot_state.attached_collision_objects:
+            if body.object.operation == CollisionObject.REMOVE:
+                self.world[body.object.id] = self.held.pop(body.object.id).object
+            else:
+                self.world.pop(body.object.id, None)
+                self.held[body.object.id] = body
+        if scene.allowed_collision_matrix.entry_names:
+            self.matrix = scene.allowed_collision_matrix
+        for item in scene.world.collision_objects:
+            if item.operation == CollisionObject.REMOVE:
+                del self.world[item.id]
+            else:
+                self.world[item.id] = item
+        self.scenes += 1
+
+
+@pytest.fixture
+def planner(client):
+    """A planner."""
+    found = Planner(client)
+    yield found
+    found.destroy()
+
+
+def test_moveit_knows_what_is_there_what_may_touch_and_what_is_held(start_node, client, planner):
+    start_node(**GRIPPER)
+    _, result = client.explore(max_views=1).result()
+    wait_for(lambda: planner.scenes == 1)
+    objects = {o.id: o for o in result.graph.objects}
+    assert planner.world.keys() == objects.keys()
+    for name, item in planner.world.items():
+        assert item.pose == objects[name].pose
+        assert item.header.frame_id == "map"
+        if objects[name].shape == "box":
+            e = objects[name].extents
+            assert list(item.primitives[0].dimensions) == [e.x, e.y, e.z]
+    supports = {frozenset((s.supporter, s.supported)) for s in result.graph.supports}
+    assert planner.touching == supports | {frozenset(("hand", "finger"))}
+
+    top, next_ = [step.object for step in client.call("order").lifts][:2]
+    assert client.call("removed", object=top).success
+    wait_for(lambda: planner.scenes == 2)
+    assert planner.world.keys() == objects.keys() - {top}
+    assert planner.held.keys() == {top}
+    assert planner.held[top].link_name == "hand"
+    assert planner.held[top].touch_links == ["hand", "finger"]
+    assert client.call("removed", object=next_).success
+    wait_for(lambda: planner.scenes == 3)
+    assert planner.world.keys() == objects.keys() - {top, next_}
+    assert planner.held.keys() == {next_}
+
+    client.explore(max_views=1, restart=True).result()
+    wait_for(lambda: planner.scenes == 4)
+    assert planner.world.keys() == {o.id for o in client.graphs[-1].objects}
+
+
+def test_without_moveit_the_scene_is_published_all_the_same(start_node, client):
+    scenes = []
+    topic = client.create_subscription(PlanningScene, "/elsewhere", scenes.append, 10)
+    start_node(planning_scene="/elsewhere")
+    client.explore(max_views=1).result()
+    wait_for(lambda: scenes)
+    client.destroy_subscription(topic)
+    assert not scenes[0].allowed_collision_matrix.entry_names
+    assert len(scenes[0].world.collision_objects) == len(client.graphs[-1].objects)
+
+
+@pytest.fixture
+def boxes(client):
+    """Boxes around the objects of the tower, published with the stamp of each depth image."""
+    objects = open_scene("tower")[1].objects
+    detections = []
+    for name, shape in objects.items():
+        pose = pose_message(make_message, shape.T_world_object)
+        box = BoundingBox3D(center=pose)
+        box.size.x, box.size.y, box.size.z = map(float, shape.extents)
+        result = ObjectHypothesisWithPose(hypothesis=ObjectHypothesis(class_id=name, score=0.9))
+        detections.append(Detection3D(results=[result], bbox=box))
+    publisher = client.create_publisher(Detection3DArray, "/boxes", 10)
+
+    def answer(image) -> None:
+        message = Detection3DArray(header=image.header, detections=detections)
+        message.header.frame_id = "map"
+        publisher.publish(message)
+
+    listener = client.create_subscription(Image, "/camera/depth", answer, qos_profile_sensor_data)
+    yield objects
+    client.destroy_subscription(listener)
+    client.destroy_publisher(publisher)
+
+
+def test_boxes_with_names_go_in_and_detections_with_names_come_out(start_node, client, boxes):
+    start_node(masks="boxes:/boxes")
+    status, result = client.explore(max_views=2).result()
+    assert (status, result.views) == (GoalStatus.STATUS_SUCCEEDED, 2), result.message
+    found = {o.id: o for o in result.graph.objects if o.role == "object"}
+    assert sorted(o.name for o in found.values()) == sorted(boxes)
+    detections = wait_for(lambda: client.detections)[-1]
+    assert {d.id for d in detections.detections} == found.keys()
+    for d in detections.detections:
+        o = found[d.id]
+        assert (d.bbox.center, d.bbox.size) == (o.pose, o.extents)
+        assert (d.results[0].hypothesis.class_id, d.results[0].hypothesis.score) == (o.name, o.probability)
+        true = boxes[o.name].T_world_object[:3, 3]
+        assert np.allclose([o.pose.position.x, o.pose.position.y, o.pose.position.z], true, atol=0.01)
+
+
+def test_label_images_are_masks(start_node, client):
+    client.set_table(topics=["depth", "colour", "info", "tf", "labels"])
+    start_node(masks="labels:/camera/labels")
+    status, result = client.explore(max_views=1).result()
+    assert status == GoalStatus.STATUS_SUCCEEDED
+    assert len(result.graph.objects) == 1 + len(open_scene("tower")[1].objects)
+
+
+def test_missing_masks_are_named(start_node, client):
+    start_node(masks="labels:/nowhere", image_timeout=1.0)
+    assert "/nowhere: no message arrived" in client.explore(max_views=1).result()[1].message
