@@ -135,7 +135,7 @@ def with_masks(view: View, masks: Any, frames: Mapping[str, Array]) -> View:
         box, size = detection.bbox.center, detection.bbox.size
         T = frames[masks.header.frame_id] @ matrix_of(box.orientation, box.position, "masks")
         half = np.array([size.x, size.y, size.z]) / 2.0 + BOX_MARGIN
-        points = transforms.transform(transforms.invert(T) @ view.T_world_camera, view.points_camera)
+        points = transforms.transform(transforms.invert(T) @ view.pose, view.points_camera)
         share = np.abs(points / half).max(axis=-1)
         labels[share < inside] = label
         inside = np.minimum(inside, share)

@@ -40,14 +40,14 @@ class PlanningSceneTopic:
     def show(self, graph: SupportGraph, lifted: SceneObject | None = None) -> None:
         """Publish the objects, which of them may touch, what is gone, and what the gripper lifted."""
         message = planning_scene(graph, self._frame, self._allowed())
-        gone, attached = self._known - set(graph), []
+        gone = self._known - set(graph)
+        attached: list[dict[str, Any]] = []
         if lifted is not None and self._links:
             if self._held:
                 attached.append({"object": {"id": self._held, "operation": REMOVE}})
             gone = (gone | {self._held} - {""}) - {lifted.id}
             self._held, body = lifted.id, collision_object(lifted, self._frame)
-            touching = {"link_name": self._links[0], "touch_links": self._links}
-            attached.append({"object": body, **touching})
+            attached.append({"object": body, "link_name": self._links[0], "touch_links": self._links})
         message["robot_state"]["attached_collision_objects"] = attached
         removed = [{"id": name, "operation": REMOVE} for name in sorted(gone)]
         message["world"]["collision_objects"] += removed
