@@ -44,7 +44,8 @@ def lay_out(spec: Any, source: str, keyframe: str | None = None) -> None:
         keyframe: Name or number of the keyframe to start from. None = `home` or the only one.
 
     Raises:
-        InputError: MuJoCo rejects the scene, it has no such keyframe, or its gravity does not point down.
+        InputError: MuJoCo rejects the scene, a pose is not finite, there is no such keyframe, or gravity does
+            not point down.
     """
     spec.compiler.fusestatic = False  # which would delete the bodies that carry objects
     model = compile_spec(spec, source)
@@ -60,6 +61,8 @@ def lay_out(spec: Any, source: str, keyframe: str | None = None) -> None:
         if key is not None:
             mujoco.mj_resetDataKeyframe(model, data, key)
             mujoco.mj_fwdPosition(model, data)
+    if not np.isfinite(data.xpos).all() or not np.isfinite(data.xquat).all():
+        raise InputError(source, "the pose of a body contains NaN or infinity", "give finite positions")
     bodies = {body.id: body for body in spec.bodies}  # their ids change with the spec
     collides = model.geom_contype | model.geom_conaffinity
     held: list[_Held] = []

@@ -95,8 +95,6 @@ def scene_from_spec(
     rest, step = (config or PhysicsConfig()).rest_window, model.opt.timestep
     if not 1e-5 <= step <= rest:
         raise InputError(source, f"its time step is {step:g} s", f"give option timestep 0.00001 to {rest:g}")
-    if not np.isfinite(model.qpos0).all():
-        raise InputError(source, "the pose of a body contains NaN or infinity", "give finite positions")
     table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, TABLE)
     free = sorted(model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist())
     if table >= 0 and model.body_weldid[table] != 0:
