@@ -7,10 +7,11 @@ import logging
 import mujoco
 import numpy as np
 import pytest
-from conftest import SMALL, run_command
+from conftest import SMALL, SMALL_SENSOR, run_command
 
 from caryatid.errors import InputError
-from caryatid.simulation import ground_truth, load_scene
+from caryatid.geometry.transforms import look_at
+from caryatid.simulation import SimulatedCamera, ground_truth, load_scene, static_boxes
 from caryatid.steps import read_run
 
 FLOOR = '<geom name="floor" type="plane" size="5 5 0.1"/>'
@@ -269,10 +270,32 @@ def test_a_geom_that_is_no_solid_is_named(write):
         load_scene(write(f"{hill}<worldbody>{FLOOR}{TABLE}{body}</worldbody>"))
 
 
+def test_a_robot_is_an_obstacle_and_hides_what_is_behind_it(write):
+    scene = load_scene(write(DRONE))
+    drone = scene.data.body("drone").xpos
+    view = SimulatedCamera(scene, sensor=SMALL_SENSOR).capture(look_at(drone + (-0.8, 0.1, 0.4), drone))
+    seen = np.zeros(view.depth.shape, dtype=bool)
+    seen[55:65, 70:90] = True
+    assert view.ignored[seen].all()
+    assert not view.depth[seen].any()
+    assert any(np.allclose(box.T_world_object[:3, 3], drone) for box in static_boxes(scene))
+
+
 def test_explore_and_evaluate_start_from_the_same_keyframe(write, tmp_path, capsys):
     run, options = tmp_path / "run", ("--no-report", "--noise", "none", "--views", "2", *SMALL)
-    assert run_command("explore", write(MENAGERIE), "--keyframe", "spread", *options, "--out", run) == 0
-    assert "robot 'base' (4 joints) is held still and is no object" in capsys.readouterr().err
+    assert (
+        run_command(
+            "explore",
+            write(MENAGERIE.replace('"base"', '"robot"')),
+            "--keyframe",
+            "spread",
+            *options,
+            "--out",
+            run,
+        )
+        == 0
+    )
+    assert "robot 'robot' (4 joints) is held still and is no object" in capsys.readouterr().err
     assert {s.pair for s in read_run(run).graph.supports} == {("o0", "o1"), ("o0", "o2")}
     assert run_command("evaluate", run, "--json") == 0
     assert '"f1": 1.0' in capsys.readouterr().out

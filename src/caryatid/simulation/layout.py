@@ -31,7 +31,7 @@ class _Held(NamedTuple):
     is_solid: bool
 
 
-def lay_out(spec: Any, source: str, keyframe: str | None = None) -> None:
+def lay_out(spec: Any, source: str, keyframe: str | None = None) -> list[int]:
     """Put a scene into its start: afterwards, its only joints are the free joints of its objects.
 
     An object is a body that can move in all six directions, with a free joint or with slides and hinges
@@ -42,6 +42,9 @@ def lay_out(spec: Any, source: str, keyframe: str | None = None) -> None:
         spec: `mujoco.MjSpec` of the scene; it is changed.
         source: Its file, for messages.
         keyframe: Name or number of the keyframe to start from. None = `home` or the only one.
+
+    Returns:
+        The numbers of the bodies of robots, which are driven by actuators.
 
     Raises:
         InputError: MuJoCo rejects the scene, a pose is not finite, there is no such keyframe, or gravity does
@@ -66,6 +69,7 @@ def lay_out(spec: Any, source: str, keyframe: str | None = None) -> None:
     bodies = {body.id: body for body in spec.bodies}  # their ids change with the spec
     collides = model.geom_contype | model.geom_conaffinity
     held: list[_Held] = []
+    robots: list[int] = []
     joints_before = len(spec.joints)
     placed = [] if key is None else np.flatnonzero(model.body_mocapid >= 0).tolist()
     for tree in range(model.ntree):
@@ -77,6 +81,7 @@ def lay_out(spec: Any, source: str, keyframe: str | None = None) -> None:
         if is_driven or not is_solid or not is_free:
             held.append(_Held(root, joints, is_driven, is_solid))
             placed += links.tolist()
+            robots += links.tolist() if is_driven else []
             for link in links.tolist():
                 _delete(spec, bodies[link].joints)
             continue
@@ -96,6 +101,7 @@ def lay_out(spec: Any, source: str, keyframe: str | None = None) -> None:
             _delete(spec, elements)
     if held:
         log.info("%s: %s", source, _what_is_held(model, held))
+    return robots
 
 
 def _chosen_keyframe(spec: Any, model: Any, source: str, wanted: str | None) -> int | None:

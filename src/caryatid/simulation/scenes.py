@@ -14,6 +14,7 @@ from typing import Final, cast
 from xml.etree import ElementTree
 
 import mujoco
+import numpy as np
 
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
@@ -162,9 +163,10 @@ def load_scene(
             spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise world.rejection(error, str(path)) from None
-    lay_out(spec, str(path), keyframe)
+    robots = lay_out(spec, str(path), keyframe)
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
     scene = world.scene_from_spec(spec, name or path.stem, str(path), config)
+    scene.geom_labels[np.isin(scene.model.geom_bodyid, robots)] = -1
     top, bodies = world.table_centre(scene)[2], scene.object_bodies
     started = scene.model.qpos0[world.pose_addresses(scene)][:, 2]
     below = [world.bounds(scene, label)[1][2] < top for label in bodies]

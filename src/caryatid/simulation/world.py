@@ -46,7 +46,7 @@ class SimulatedScene:
         source: Its file or built-in name, for messages.
         object_bodies: Body name of each object by its label 1…n, in the order of the bodies.
         surfaces: Geoms of everything static that may carry objects, by name, the main surface first.
-        geom_labels: Label (G,) of the object each geom belongs to, 0 for everything else.
+        geom_labels: Label (G,) of the object each geom belongs to, −1 for a robot, 0 for everything else.
         at_rest: Whether nothing moved any more when settling ended.
     """
 
@@ -535,7 +535,7 @@ def true_shapes(scene: SimulatedScene) -> dict[int, Shape]:
 def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
     """Oriented boxes around all geoms that belong to no object, the table's first; planes are left out."""
     flat = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
-    geoms = dict.fromkeys([*scene.geoms(0), *np.flatnonzero(scene.geom_labels == 0).tolist()])
+    geoms = dict.fromkeys([*scene.geoms(0), *np.flatnonzero(scene.geom_labels <= 0).tolist()])
     return tuple(_geom_box(scene, g) for g in geoms if int(scene.model.geom_type[g]) not in flat)
 
 
