@@ -52,20 +52,22 @@ def lay_out(spec: Any, source: str, keyframe: str | None = None) -> list[int]:
     """
     spec.compiler.fusestatic = False  # which would delete the bodies that carry objects
     model = compile_spec(spec, source)
-    gravity = model.opt.gravity
+    gravity = 0.0 if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY else 1.0
+    gravity *= model.opt.gravity
     if not gravity[2] < -100.0 * np.hypot(gravity[0], gravity[1]):
-        reason = f"its gravity is {' '.join(f'{g:g}' for g in gravity)}, but z has to point up"
-        raise InputError(source, reason, "turn the scene, and give option gravity '0 0 -9.81'")
+        reason = f"its gravity is {' '.join(f'{g + 0.0:g}' for g in gravity)} m/s², not along -z"
+        raise InputError(source, reason, "turn the scene so that z points up, or correct option gravity")
     data = mujoco.MjData(model)
     with mujoco_warnings_ignored():
         mujoco.mj_fwdPosition(model, data)
         driven, directions = _driven_dofs(model, data), data.cdof.copy()
-        key = _chosen_keyframe(spec, model, source, keyframe)
+        key = _chosen_keyframe(model, source, keyframe)
         if key is not None:
             mujoco.mj_resetDataKeyframe(model, data, key)
             mujoco.mj_fwdPosition(model, data)
-    if not np.isfinite(data.xpos).all() or not np.isfinite(data.xquat).all():
-        raise InputError(source, "the pose of a body contains NaN or infinity", "give finite positions")
+    if not all(np.isfinite(poses).all() for poses in (data.xpos, data.xquat, directions)):
+        reason = "the pose of a body or joint contains NaN or infinity"
+        raise InputError(source, reason, "give finite positions")
     bodies = {body.id: body for body in spec.bodies}  # their ids change with the spec
     collides = model.geom_contype | model.geom_conaffinity
     held: list[_Held] = []
@@ -75,7 +77,8 @@ def lay_out(spec: Any, source: str, keyframe: str | None = None) -> list[int]:
     for tree in range(model.ntree):
         dofs, links = (np.flatnonzero(of == tree) for of in (model.dof_treeid, model.body_treeid))
         root, joints = int(links[0]), int(model.body_jntnum[links].sum())
-        is_driven, is_solid = not driven.isdisjoint(dofs), collides[np.isin(model.geom_bodyid, links)].any()
+        is_driven, is_soft = not driven.isdisjoint(dofs), np.isin(model.flex_vertbodyid, links).any()
+        is_solid = is_soft or collides[np.isin(model.geom_bodyid, links)].any()
         is_free = len(dofs) == np.linalg.matrix_rank(directions[dofs]) == 6
         is_free &= joints == model.body_jntnum[root] and model.body_parentid[root] == 0
         if is_driven or not is_solid or not is_free:
@@ -104,7 +107,7 @@ def lay_out(spec: Any, source: str, keyframe: str | None = None) -> list[int]:
     return robots
 
 
-def _chosen_keyframe(spec: Any, model: Any, source: str, wanted: str | None) -> int | None:
+def _chosen_keyframe(model: Any, source: str, wanted: str | None) -> int | None:
     """Number of the keyframe to start from, or None for the model's initial pose; say which one it is."""
     names = [model.key(k).name or str(k) for k in range(model.nkey)]
     if wanted is not None:
@@ -118,9 +121,7 @@ def _chosen_keyframe(spec: Any, model: Any, source: str, wanted: str | None) -> 
         log.info("%s: starts from none of its keyframes %s; --keyframe chooses one", source, ", ".join(names))
         return None
     key = names.index(HOME) if HOME in names else 0
-    given, all_of_them = len(spec.keys[key].qpos), model.nq
-    part = f", which has {given} of {all_of_them} coordinates" if 0 < given < all_of_them else ""
-    log.info("%s: starts from its keyframe '%s'%s", source, names[key], part)
+    log.info("%s: starts from its keyframe '%s'", source, names[key])
     return key
 
 

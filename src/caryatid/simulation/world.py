@@ -136,8 +136,9 @@ def rejection(error: ValueError, source: str, spec: Any = None) -> InputError:
         users = [f"asset '{each.name}'" for each in assets if each.file and missing[1].endswith(each.file)]
         reason = f"{users[0] if users else 'it'} needs the file '{missing[1]}', which cannot be read"
         return InputError(source, reason, "put the file there, or correct its path")
-    if "XML parse error" in reason:
-        return InputError(source, f"not an MJCF file ({reason})", "correct the XML")
+    if "XML parse error" in reason or "XML model type" in reason:
+        remedy = "correct the XML" if "parse" in reason else "give a file that begins with <mujoco>"
+        return InputError(source, f"not an MJCF file ({reason})", remedy)
     return InputError(source, f"MuJoCo rejects it: {reason}", "correct the MJCF")
 
 
