@@ -253,6 +253,10 @@ def test_a_keyframe_that_is_not_there(write, source, keyframe, says):
         load_scene(source if source == "tower" else write(source), keyframe=keyframe)
 
 
+def test_a_recording_has_no_keyframe(refused, recording):
+    refused("explore", recording, "--keyframe", "home", says="--keyframe is for scenes")
+
+
 def test_a_body_too_heavy_for_a_table_is_pointed_out(write, caplog):
     caplog.set_level(logging.INFO)
     crate = cube("crate", "1 0 0.2").replace("0.03 0.03 0.03", "0.2 0.2 0.2")

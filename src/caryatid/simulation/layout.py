@@ -22,13 +22,22 @@ NAMED = 5
 """Maximum number of bodies that a message names."""
 
 
-class _Held(NamedTuple):
-    """A tree of bodies that is held still: its root, its number of joints, and what it is."""
+class _Tree(NamedTuple):
+    """Bodies that move together or in each other, and what they are.
 
-    root: int
+    Attributes:
+        links: Their numbers, the root first.
+        joints: Number of their joints.
+        is_driven: Whether actuators move them.
+        is_solid: Whether anything can touch them.
+        is_object: Whether they are a single solid body that moves freely.
+    """
+
+    links: list[int]
     joints: int
     is_driven: bool
     is_solid: bool
+    is_object: bool
 
 
 def lay_out(spec: Any, source: str, keyframe: str | None = None) -> list[int]:
@@ -58,53 +67,64 @@ def lay_out(spec: Any, source: str, keyframe: str | None = None) -> list[int]:
         reason = f"its gravity is {' '.join(f'{g + 0.0:g}' for g in gravity)} m/s², not along -z"
         raise InputError(source, reason, "turn the scene so that z points up, or correct option gravity")
     data = mujoco.MjData(model)
-    with mujoco_warnings_ignored():
-        mujoco.mj_fwdPosition(model, data)
-        driven, directions = _driven_dofs(model, data), data.cdof.copy()
-        key = _chosen_keyframe(model, source, keyframe)
-        if key is not None:
-            mujoco.mj_resetDataKeyframe(model, data, key)
-            mujoco.mj_fwdPosition(model, data)
-    if not all(np.isfinite(poses).all() for poses in (data.xpos, data.xquat, directions)):
-        reason = "the pose of a body or joint contains NaN or infinity"
-        raise InputError(source, reason, "give finite positions")
+    _compute(model, data, source)
+    trees = _find_trees(model, data)
+    held = [tree for tree in trees if not tree.is_object]
+    key = _chosen_keyframe(model, source, keyframe)
+    placed = [link for tree in held for link in tree.links]
+    if key is not None:
+        mujoco.mj_resetDataKeyframe(model, data, key)
+        _compute(model, data, source)
+        placed += np.flatnonzero(model.body_mocapid >= 0).tolist()
     bodies = {body.id: body for body in spec.bodies}  # their ids change with the spec
-    collides = model.geom_contype | model.geom_conaffinity
-    held: list[_Held] = []
-    robots: list[int] = []
-    joints_before = len(spec.joints)
-    placed = [] if key is None else np.flatnonzero(model.body_mocapid >= 0).tolist()
-    for tree in range(model.ntree):
-        dofs, links = (np.flatnonzero(of == tree) for of in (model.dof_treeid, model.body_treeid))
-        root, joints = int(links[0]), int(model.body_jntnum[links].sum())
-        is_driven, is_soft = not driven.isdisjoint(dofs), np.isin(model.flex_vertbodyid, links).any()
-        is_solid = is_soft or collides[np.isin(model.geom_bodyid, links)].any()
-        is_free = len(dofs) == np.linalg.matrix_rank(directions[dofs]) == 6
-        is_free &= joints == model.body_jntnum[root] and model.body_parentid[root] == 0
-        if is_driven or not is_solid or not is_free:
-            held.append(_Held(root, joints, is_driven, is_solid))
-            placed += links.tolist()
-            robots += links.tolist() if is_driven else []
-            for link in links.tolist():
-                _delete(spec, bodies[link].joints)
-            continue
-        bodies[root].name = bodies[root].name or f"body {root}"
-        if joints > 1:
-            _delete(spec, bodies[root].joints)
-            bodies[root].add_freejoint()
-        if joints > 1 or key is not None:
-            placed.append(root)
+    for link in list(placed):
+        _delete(bodies[link].joints, spec)
+    for tree in trees:
+        if tree.is_object:
+            root = bodies[tree.links[0]]
+            root.name = root.name or f"body {tree.links[0]}"
+            if tree.joints > 1:
+                _delete(root.joints, spec)
+                root.add_freejoint()
+            if tree.joints > 1 or key is not None:
+                placed.append(tree.links[0])
     for number in placed:
         _place(bodies[number], number, model, data)
-    _delete(spec, spec.keys)  # whose numbers no longer fit
-    if len(spec.joints) < joints_before:
+    _delete(spec.keys, spec)  # whose numbers no longer fit
+    if len(spec.joints) < model.njnt:
         of_joints = (mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_TENDON)
         equalities = [each for each in spec.equalities if each.type in of_joints]
         for elements in (spec.actuators, spec.sensors, spec.tendons, spec.tuples, equalities):
-            _delete(spec, elements)
+            _delete(elements, spec)
     if held:
         log.info("%s: %s", source, _what_is_held(model, held))
-    return robots
+    return [link for tree in held if tree.is_driven for link in tree.links]
+
+
+def _compute(model: Any, data: Any, source: str) -> None:
+    """Compute all that follows from the positions of a state; reject NaN."""
+    with mujoco_warnings_ignored():
+        mujoco.mj_fwdPosition(model, data)
+    if not all(np.isfinite(found).all() for found in (data.xpos, data.xquat, data.cdof)):
+        reason = "the pose of a body or joint contains NaN or infinity"
+        raise InputError(source, reason, "give finite positions")
+
+
+def _find_trees(model: Any, data: Any) -> list[_Tree]:
+    """All that moves, in a state at which no two hinges of a body are parallel."""
+    driven = _driven_dofs(model, data)
+    collides = model.geom_contype | model.geom_conaffinity
+    trees = []
+    for tree in range(model.ntree):
+        dofs, links = (np.flatnonzero(of == tree) for of in (model.dof_treeid, model.body_treeid))
+        joints, root = int(model.body_jntnum[links].sum()), links[0]
+        is_driven, is_soft = not driven.isdisjoint(dofs), np.isin(model.flex_vertbodyid, links).any()
+        is_solid = bool(is_soft or collides[np.isin(model.geom_bodyid, links)].any())
+        is_alone = joints == model.body_jntnum[root] and model.body_parentid[root] == 0
+        is_free = is_alone and len(dofs) == np.linalg.matrix_rank(data.cdof[dofs]) == 6
+        is_object = bool(is_free and is_solid and not is_driven)
+        trees.append(_Tree(links.tolist(), joints, is_driven, is_solid, is_object))
+    return trees
 
 
 def _chosen_keyframe(model: Any, source: str, wanted: str | None) -> int | None:
@@ -153,14 +173,14 @@ def _place(body: Any, number: int, model: Any, data: Any) -> None:
     body.pos, body.quat = T_parent_body[:3, 3], quaternion(T_parent_body[:3, :3])
 
 
-def _what_is_held(model: Any, held: list[_Held]) -> str:
+def _what_is_held(model: Any, held: list[_Tree]) -> str:
     """The sentence that names what is held still, and why it is no object."""
-    trees_on = Counter(int(model.body_rootid[each.root]) for each in held)
+    trees_on = Counter(int(model.body_rootid[each.links[0]]) for each in held)
     texts = []
     for each in held[:NAMED]:
-        top = int(model.body_rootid[each.root])
-        number = top if trees_on[top] == 1 else each.root
-        name = model.body(number).name or model.body(each.root).name or f"body {number}"
+        top = int(model.body_rootid[each.links[0]])
+        number = top if trees_on[top] == 1 else each.links[0]
+        name = model.body(number).name or model.body(each.links[0]).name or f"body {number}"
         count = f"{each.joints} joint{'s' if each.joints > 1 else ''}"
         if each.is_driven or each.is_solid:
             texts.append(f"{'robot' if each.is_driven else 'body'} '{name}' ({count})")
@@ -177,6 +197,6 @@ def _what_is_held(model: Any, held: list[_Held]) -> str:
     return text
 
 
-def _delete(spec: Any, elements: Any) -> None:
+def _delete(elements: Any, spec: Any) -> None:
     for element in list(elements):
         spec.delete(element)
