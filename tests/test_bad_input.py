@@ -206,7 +206,6 @@ def test_one_setting_limits_the_size_of_images(recording, refused, tmp_path, cap
 
 HILLS = '<hfield name="hills" nrow="20000" ncol="20000" size="1 1 1 1"/>'
 MANY = '<replicate count="1000"><replicate count="1000"><geom size="0.1"/></replicate></replicate>'
-WEIGHT = '<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
 
 
 @pytest.mark.parametrize(
@@ -216,12 +215,15 @@ WEIGHT = '<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
         ("<freejoint/>", "", "has no objects"),
         ("</mujoco>", "", "not an MJCF file"),
         (TWO_ON_A_TABLE, "a table with two cups", "not an MJCF file"),
+        (TWO_ON_A_TABLE, "<mujocoinclude/>", "give a file that begins with <mujoco>"),
         ('size="0.035 0.05"', 'size="-1 0.05"', "MuJoCo rejects it"),
         ('size="0.4 0.5 0.35"/>', 'size="0.4 0.5 0.35"/><freejoint/>', "'table' can move"),
         ('type="cylinder" size="0.035 0.05"', 'type="mesh" mesh="lost"', "lost"),
         ('<geom type="box" size="0.4 0.5 0.35"/>', "", "body 'table' has no geom"),
-        (' name="crate"', "", "has no name"),
-        ('<geom type="box" size="0.08 0.09 0.05"/>', WEIGHT, "body 'crate' has no geom"),
+        ("<worldbody>", '<include file="arm.xml"/><worldbody>', "it needs the file"),
+        ("<worldbody>", '<asset><mesh name="cup" file="cup.stl"/></asset><worldbody>', "asset 'cup' needs"),
+        ("<worldbody>", '<option gravity="0 -9.81 0"/><worldbody>', "not along -z"),
+        ("<freejoint/>", '<joint type="slide" axis="nan 0 0"/>', "NaN"),
         ('pos="0 0 0.75"', 'pos="0 nan 0.75"', "NaN"),
         ("<worldbody>", '<option timestep="0"/><worldbody>', "its time step is 0 s"),
         ("<worldbody>", '<option timestep="nan"/><worldbody>', "its time step is nan s"),

@@ -36,7 +36,7 @@ from caryatid.simulation import (
 from caryatid.simulation.camera import add_depth_noise, axial_sigma
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.scenes import DESIGNED, is_builtin
-from caryatid.simulation.setup import HumanoidBody, make_simulation
+from caryatid.simulation.setup import BODY, HumanoidBody, make_simulation
 from caryatid.simulation.world import (
     bounds,
     mean_contact_forces,
@@ -459,7 +459,7 @@ def between(one: Posture, other: Posture):
 def clearance(body: HumanoidBody) -> float:
     """How near a body is to anything but the floor [m], negative inside."""
     model, data = body.scene.model, body.scene.data
-    mine = np.flatnonzero(model.geom_bodyid == model.body("robot").id).tolist()
+    mine = np.flatnonzero(model.geom_bodyid == model.body(BODY).id).tolist()
     others = [g for g in range(model.ngeom) if g not in mine and model.geom(g).name != "floor"]
     return min(mujoco.mj_geomDistance(model, data, a, b, 10.0, None) for a in mine for b in others)
 

@@ -126,6 +126,7 @@ def open_source(
     masks: MaskSource | None = None,
     ignore: Path | None = None,
     level: bool = False,
+    keyframe: str | None = None,
 ) -> Source:
     """Open an MJCF file or folder, the name of a built-in scene, or a recording.
 
@@ -133,7 +134,7 @@ def open_source(
 
     Raises:
         InputError: The source is unknown, broken, or lacks required labels; or the robot is unknown, a
-            robot is given for a recording, or an ignore mask or `level` for a simulation.
+            robot or keyframe is given for a recording, or an ignore mask or `level` for a simulation.
         PlanningError: The robot cannot reach a view of the table.
     """
     kind = _viewable(source)
@@ -143,13 +144,15 @@ def open_source(
         if robot != HUMANOID:
             reason = "a recording has no robot, because its camera poses are fixed"
             raise InputError(source, reason, "omit --robot")
+        if keyframe is not None:
+            raise InputError(source, "is a recording, and --keyframe is for scenes", "omit --keyframe")
         recording = open_recording(source, config, segmentation, masks, ignore, level)
         poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
         return Source(recording.path.name, RecordingCamera(recording), RecordingRobot(poses), None)
     for option, given in (("--ignore", ignore is not None), ("--level", level)):
         if given:
             raise InputError(source, f"is a simulation, and {option} is for recordings", f"omit {option}")
-    return simulate(source, noise=noise, robot=robot, seed=seed, config=config)
+    return simulate(source, noise=noise, robot=robot, seed=seed, config=config, keyframe=keyframe)
 
 
 def simulate(
@@ -159,6 +162,7 @@ def simulate(
     robot: str = HUMANOID,
     seed: int = 0,
     config: Config | None = None,
+    keyframe: str | None = None,
 ) -> Source:
     """Simulate a scene, a robot in front of it, and the robot's camera.
 
@@ -168,19 +172,20 @@ def simulate(
         robot: Name of the robot: `humanoid`, `arm:FILE.npz` or `module:callable`.
         seed: Seed of the noise.
         config: All settings, or None for the defaults.
+        keyframe: Name or number of a keyframe of an MJCF scene to start from; None = `home` or the only one.
 
     Returns:
         The camera, the robot at its first view, and the ground truth.
 
     Raises:
-        InputError: The scene, noise model or robot is unknown.
+        InputError: The scene, keyframe, noise model or robot is unknown.
         PlanningError: The robot cannot reach a view of the table.
     """
     check_type("scene", scene, (str, Path), "give the name of a built-in scene, or an MJCF file")
     check_type("config", config, (Config, NoneType), "give a caryatid.Config")
     check_type("robot", robot, str, "give the name of a robot, such as humanoid")
     config = config or Config()
-    make, loaded = find_robot(robot), load_scene(scene, config.physics)
+    make, loaded = find_robot(robot), load_scene(scene, config.physics, keyframe)
     truth = true_scene_from_simulation(loaded)
     made = make_simulation(loaded, config, noise=noise, seed=seed, robot=make)
     return Source(loaded.name, made.camera, made.robot, truth)

@@ -282,6 +282,8 @@ class ExploringCommand(PlanningCommand):
     """Rotate the world frame of a recording so that the table is level; use it if z does not point up."""
     noise: NoiseModel = "carmine"
     """Noise of the simulated camera: depth noise and registration error of a Carmine, or none."""
+    keyframe: Annotated[str | None, shown("NAME", "home, or the only one")] = None
+    """Name or number of the keyframe that an MJCF scene starts from."""
 
     def config(self, options: Mapping[str, object] | None = None) -> Config:
         """All settings; `options` as for `Settings.read`."""

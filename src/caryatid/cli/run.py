@@ -209,7 +209,7 @@ def _open(command: Explore | Clear, config: Config) -> tuple[Source, MaskSource 
 def _open_source(command: Explore | View | Clear, masks: MaskSource | None, config: Config) -> Source:
     return open_source(
         command.source, config, noise=command.noise, robot=command.robot, masks=masks, ignore=command.ignore,
-        level=command.level, **command.looking,
+        level=command.level, keyframe=command.keyframe, **command.looking,
     )  # fmt: skip
 
 
@@ -260,7 +260,10 @@ def _conditions(command: Explore | Extract | Clear) -> str:
 
 def _about(command: Explore | Extract | Clear) -> dict[str, Any]:
     """Entries of run.json about the command."""
-    names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands", "reach")
+    names = (
+        "robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands", "reach",
+        "keyframe",
+    )  # fmt: skip
     known = {field.name: getattr(command, field.name) for field in fields(command)}
     options = {name: known[name] for name in names if name in known}
     options |= {"preset": command.settings.preset, "masks": command.settings.masks}

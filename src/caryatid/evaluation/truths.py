@@ -77,9 +77,11 @@ def evaluate_run(
     source = str(truth)
     folder = find_sample(source)
     if is_builtin(source) or (folder / SCENE_FILE).is_file() or folder.suffix == ".xml":
+        keyframe = run.record.get("options", {}).get("keyframe")
+        scene = load_scene(source, keyframe=None if is_builtin(source) else keyframe)
         scores = [
             score(view.graph, true, config=config)
-            for view, true in zip(run.views, _truths(run, load_scene(source)), strict=True)
+            for view, true in zip(run.views, _truths(run, scene), strict=True)
         ]
     elif (folder / "scene_camera.json").is_file():
         known, recording = read_truth(folder / TRUTH_FILE), read_recording(folder)

@@ -72,6 +72,7 @@ class Rendering:
         normals_world: Unit normals (H, W, 3) that face the camera, zero where there is nothing.
         incidence: Angle (H, W) [rad] between ray and normal; π/2 where there is nothing.
         labels: Label of the object (H, W), 0 = anything else.
+        robots: Where a robot of the scene is seen (H, W).
         rgb: Colour (H, W, 3) uint8.
     """
 
@@ -79,6 +80,7 @@ class Rendering:
     normals_world: Array
     incidence: Array
     labels: NDArray[np.int32]
+    robots: NDArray[np.bool_]
     rgb: NDArray[np.uint8]
 
 
@@ -138,7 +140,7 @@ class SimulatedCamera:
 
         Returns:
             The view. With noise, its depth is noisy, it has no normals, and its pose is the reported one;
-            labels stay even where depth is missing.
+            labels stay even where depth is missing. Robots of the scene are ignored.
 
         Raises:
             InputError: The pose is not a rigid transform.
@@ -156,7 +158,11 @@ class SimulatedCamera:
         else:
             depth = add_depth_noise(image.depth, image.incidence, self.noise_config, rng)
             T_reported, normals = misregister(T, self.noise_config, rng) if number else T, None
-        return View(depth.astype(np.float32), self.K, T_reported, image.rgb, image.labels, normals, name)
+        ignored = image.robots if image.robots.any() else None
+        return View(
+            depth.astype(np.float32), self.K, T_reported, image.rgb, image.labels, normals, name,
+            ignored=ignored,
+        )  # fmt: skip
 
 
 def intrinsics(sensor: SensorConfig) -> Array:
@@ -188,7 +194,8 @@ def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: Senso
     incidence = np.arccos(np.minimum(np.abs(cosine), 1.0)).reshape(shape)
     labels = np.append(scene.geom_labels, np.int32(0))[geoms].reshape(shape)
     rgb = _shade(scene, geoms, normals_world, sensor).reshape(*shape, 3)
-    return Rendering(depth.reshape(shape), normals_world.reshape(*shape, 3), incidence, labels, rgb)
+    objects, robots = np.maximum(labels, 0), labels < 0
+    return Rendering(depth.reshape(shape), normals_world.reshape(*shape, 3), incidence, objects, robots, rgb)
 
 
 def pixel_rays(K: Array, R_world_camera: Array, width: int, height: int) -> tuple[Array, Array]:

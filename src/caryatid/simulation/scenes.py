@@ -14,11 +14,13 @@ from typing import Final, cast
 from xml.etree import ElementTree
 
 import mujoco
+import numpy as np
 
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
 from caryatid.simulation import world
 from caryatid.simulation.generation import SIZES, GeneratedKind, generate
+from caryatid.simulation.layout import lay_out, unknown_keyframe
 from caryatid.simulation.world import Body, SimulatedScene, box, cylinder, sphere
 
 log = logging.getLogger(__name__)
@@ -114,7 +116,13 @@ _SIZED: Final[Mapping[str, tuple[str, ...]]] = {
 _GENERATED = re.compile(rf"({'|'.join(SIZES)})-(\d+)-(\d+)")
 
 
-def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None) -> SimulatedScene:
+HEAVY = 10.0
+"""Weight of a body that is not on a table as a rule [kg]."""
+
+
+def load_scene(
+    source: str | PathLike[str], config: PhysicsConfig | None = None, keyframe: str | None = None
+) -> SimulatedScene:
     """Load a scene and let it come to rest.
 
     Built-in names come before files: a designed scene (`tower`, `bridge`, …), or KIND-SIZE-SEED for a scene
@@ -123,11 +131,15 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
     Args:
         source: A built-in name, an MJCF file, or a folder with a `scene.xml`.
         config: When a scene is at rest.
+        keyframe: Name or number of a keyframe of an MJCF file to start from; None = `home` or the only one.
 
     Raises:
-        InputError: No such file or scene, broken XML, no objects, nothing carries them, or it is unstable.
+        InputError: No such file, scene or keyframe, broken XML, no objects, nothing carries them, or it is
+            unstable.
     """
     text = fspath(source)
+    if keyframe is not None and is_builtin(text):
+        raise unknown_keyframe(text, keyframe, [])
     if text in DESIGNED:  # give the solids a second to find their contacts
         return world.scene_from_spec(world.build_spec(DESIGNED[text], text), text, text, config, least=1.0)
     if match := _GENERATED.fullmatch(text):
@@ -150,16 +162,21 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
         with world.mujoco_warnings_ignored():
             spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise InputError(path, f"not an MJCF file ({reason})", "correct the XML") from None
+        raise world.rejection(error, str(path)) from None
+    robots = lay_out(spec, str(path), keyframe)
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
     scene = world.scene_from_spec(spec, name or path.stem, str(path), config)
+    scene.geom_labels[np.isin(scene.model.geom_bodyid, robots)] = -1
     top, bodies = world.table_centre(scene)[2], scene.object_bodies
     started = scene.model.qpos0[world.pose_addresses(scene)][:, 2]
     below = [world.bounds(scene, label)[1][2] < top for label in bodies]
     fallen = [name for name, z, low in zip(bodies.values(), started, below, strict=True) if low and z > top]
     if fallen:
         log.warning("%s: %s fell off the %s before the first view", path, ", ".join(fallen), scene.table)
+    for name in bodies.values():
+        if (mass := float(scene.model.body(name).subtreemass[0])) > HEAVY:
+            hint = "%s: %s (%.3g kg) counts as an object; if it is none, remove its joint"
+            log.info(hint, path, name, mass)
     if not scene.at_rest:
         log.warning("%s: the scene still moves; its ground truth may change between views", path)
     return scene

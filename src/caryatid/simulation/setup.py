@@ -22,6 +22,9 @@ from caryatid.simulation.world import SimulatedScene, bounds, static_boxes, tabl
 PLATFORM, MAST, NECK = 0.3, 0.04, 0.15
 """Maximum height of the platform, radius of its mast, and distance from the mast's end to the camera [m]."""
 
+BODY = "caryatid-robot"
+"""Name of the robot's body, which no scene has."""
+
 
 class HumanoidBody:
     """A platform and a mast that the torso lift extends, in a copy of a scene.
@@ -38,7 +41,7 @@ class HumanoidBody:
         low, high = config.camera_height
         self._platform_height = min(PLATFORM, low / 2.0)
         spec = scene.spec.copy()
-        body = spec.worldbody.add_body(name="robot", mocap=True)
+        body = spec.worldbody.add_body(name=BODY, mocap=True)
         # The mast has its maximum length, because MuJoCo bounds a geom only once.
         for radius, height in ((config.footprint, self._platform_height), (MAST, high)):
             body.add_geom(
@@ -50,7 +53,7 @@ class HumanoidBody:
         data.qpos[:] = scene.data.qpos
         labels = np.append(scene.geom_labels, np.zeros(2, dtype=np.int32))
         self.scene = replace(scene, model=model, data=data, spec=spec, geom_labels=labels)
-        self._geoms = np.flatnonzero(model.geom_bodyid == model.body("robot").id)
+        self._geoms = np.flatnonzero(model.geom_bodyid == model.body(BODY).id)
 
     def place(self, posture: Posture) -> None:
         """Move it to a posture."""

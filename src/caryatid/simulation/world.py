@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -45,7 +46,7 @@ class SimulatedScene:
         source: Its file or built-in name, for messages.
         object_bodies: Body name of each object by its label 1…n, in the order of the bodies.
         surfaces: Geoms of everything static that may carry objects, by name, the main surface first.
-        geom_labels: Label (G,) of the object each geom belongs to, 0 for everything else.
+        geom_labels: Label (G,) of the object each geom belongs to, −1 for a robot, 0 for everything else.
         at_rest: Whether nothing moved any more when settling ended.
     """
 
@@ -90,17 +91,10 @@ def scene_from_spec(
     Raises:
         InputError: It does not compile, has no objects, nothing static carries one, or it is unstable.
     """
-    try:
-        with mujoco_warnings_ignored():
-            model = spec.compile()
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise InputError(source, f"MuJoCo rejects it: {reason}", "correct the MJCF") from None
+    model = compile_spec(spec, source)
     rest, step = (config or PhysicsConfig()).rest_window, model.opt.timestep
     if not 1e-5 <= step <= rest:
         raise InputError(source, f"its time step is {step:g} s", f"give option timestep 0.00001 to {rest:g}")
-    if not np.isfinite(model.qpos0).all():
-        raise InputError(source, "the pose of a body contains NaN or infinity", "give finite positions")
     table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, TABLE)
     free = sorted(model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist())
     if table >= 0 and model.body_weldid[table] != 0:
@@ -112,17 +106,40 @@ def scene_from_spec(
     if len(free) > MAX_LABEL:
         raise InputError(source, f"has {len(free)} objects", f"at most {MAX_LABEL} are supported")
     names = {label: str(model.body(body).name) for label, body in enumerate(free, start=1)}
-    if "" in names.values():
-        raise InputError(source, "an object has no name", "name every body with a free joint")
     geom_roots = model.body_rootid[model.geom_bodyid]
     geom_labels = np.where(np.isin(geom_roots, free), np.searchsorted(free, geom_roots) + 1, 0)
-    if unseen := set(names) - set(geom_labels.tolist()):
-        raise InputError(source, f"body '{names[min(unseen)]}' has no geom", "give every object a shape")
     data, labels = mujoco.MjData(model), geom_labels.astype(np.int32)
     config = config or PhysicsConfig()
     at_rest = _settle(model, data, source, config, least=least)
     scene = SimulatedScene(model, data, spec, name, source, names, _static_geoms(model), labels, at_rest)
     return scene if table >= 0 else _with_main_surface(scene, config.force_share)
+
+
+def compile_spec(spec: Any, source: str) -> Any:
+    """Compile a `mujoco.MjSpec`.
+
+    Raises:
+        InputError: MuJoCo rejects it, or a file of it is missing.
+    """
+    try:
+        with mujoco_warnings_ignored():
+            return spec.compile()
+    except ValueError as error:
+        raise rejection(error, source, spec) from None
+
+
+def rejection(error: ValueError, source: str, spec: Any = None) -> InputError:
+    """What MuJoCo says about an MJCF file, with the cause and the remedy."""
+    reason = " ".join(str(error).split()).removeprefix("XML Error: ").removeprefix("Error: ")
+    if missing := re.search(r"Error opening file '(.+?)'", reason):
+        assets = () if spec is None else (*spec.meshes, *spec.textures, *spec.hfields, *spec.skins)
+        users = [f"asset '{each.name}'" for each in assets if each.file and missing[1].endswith(each.file)]
+        reason = f"{users[0] if users else 'it'} needs the file '{missing[1]}', which cannot be read"
+        return InputError(source, reason, "put the file there, or correct its path")
+    if "XML parse error" in reason or "XML model type" in reason:
+        remedy = "correct the XML" if "parse" in reason else "give a file that begins with <mujoco>"
+        return InputError(source, f"not an MJCF file ({reason})", remedy)
+    return InputError(source, f"MuJoCo rejects it: {reason}", "correct the MJCF")
 
 
 def _static_geoms(model: Any) -> dict[str, list[int]]:
@@ -478,9 +495,10 @@ def _outline(scene: SimulatedScene, geom: int) -> Array:
             mesh = model.mesh(model.geom_dataid[geom])
             points = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]].astype(np.float64)
         case kind:
-            body = model.body(model.geom_bodyid[geom]).name
-            reason = f"a {_GEOM(kind).name.removeprefix('mjGEOM_').lower()} geom is not a solid shape"
-            raise InputError(f"body '{body}'", reason, "use primitives or meshes")
+            body, name = model.body(model.geom_bodyid[geom]).name, model.geom(geom).name or str(geom)
+            shape_name = _GEOM(kind).name.removeprefix("mjGEOM_").lower()
+            reason = f"geom '{name}' of body '{body}' is of the type {shape_name}"
+            raise InputError(scene.source, reason, "use primitives or meshes")
     return transforms.transform(_geom_pose(scene, geom), points)
 
 
@@ -518,7 +536,7 @@ def true_shapes(scene: SimulatedScene) -> dict[int, Shape]:
 def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
     """Oriented boxes around all geoms that belong to no object, the table's first; planes are left out."""
     flat = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
-    geoms = dict.fromkeys([*scene.geoms(0), *np.flatnonzero(scene.geom_labels == 0).tolist()])
+    geoms = dict.fromkeys([*scene.geoms(0), *np.flatnonzero(scene.geom_labels <= 0).tolist()])
     return tuple(_geom_box(scene, g) for g in geoms if int(scene.model.geom_type[g]) not in flat)
 
 
