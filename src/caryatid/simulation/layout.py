@@ -84,6 +84,8 @@ def lay_out(spec: Any, source: str, keyframe: str | None = None) -> list[int]:
             root = bodies[tree.links[0]]
             root.name = root.name or f"body {tree.links[0]}"
             if tree.joints > 1:
+                how = "a free joint replaces its slides and hinges"
+                log.info("%s: body '%s' is free: %s", source, root.name, how)
                 _delete(root.joints, spec)
                 root.add_freejoint()
             if tree.joints > 1 or key is not None:
