@@ -20,7 +20,7 @@ from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
 from caryatid.graph import SupportGraph
-from caryatid.io.datasets import Dataset, Frame, find_sample, format_of, open_dataset
+from caryatid.io.datasets import Dataset, Frame, OpenOptions, find_sample, format_of, open_dataset
 from caryatid.io.graph_json import read_graph
 from caryatid.io.importing import choose_frames, levelled
 from caryatid.io.mask_sources import MaskSource, without_ignored
@@ -204,7 +204,8 @@ def open_recording(
         InputError: The dataset or the mask is broken, required labels are missing, a segment is too small
             for a shape, or no table is visible to level the world frame.
     """
-    recording = open_dataset(folder, config.recording)
+    use_masks = masks is None and segmentation != "auto"
+    recording = open_dataset(folder, config.recording, OpenOptions(masks=use_masks))
     if recording.is_video:
         recording = choose_frames(recording, config.recording)
     if ignore is not None:
@@ -214,12 +215,12 @@ def open_recording(
         recording = levelled(recording, config)
     for note in recording.notes:
         log.info(note)
-    if segmentation == "labels" and masks is None and not recording.has_labels:
+    if segmentation == "labels" and use_masks and not recording.has_labels:
         raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
     points: Counter[int] = Counter()
     for frame in recording.frames:
         view = frame.load()
-        if view.labels is not None and masks is None:
+        if view.labels is not None and use_masks:
             pixels = np.bincount(view.labels[view.valid])
             points.update({label: int(pixels[label]) for label in np.flatnonzero(pixels).tolist()})
     if segmentation != "auto":

@@ -135,6 +135,7 @@ class OpenOptions:
         rgb: Topic of colour images, or None.
         world: Frame of a bag that is the world, level with z up; None takes no poses.
         camera_file: Camera of a TUM RGB-D folder, or None for the published ones.
+        masks: Whether the masks of a recording are read.
     """
 
     depth: str | None = None
@@ -142,6 +143,7 @@ class OpenOptions:
     rgb: str | None = None
     world: str | None = None
     camera_file: Path | None = None
+    masks: bool = True
 
 
 def format_of(path: Path) -> Any:

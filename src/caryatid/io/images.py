@@ -34,12 +34,16 @@ class BrokenImageError(InputError):
 
 
 def read_depth(path: Path, depth_scale: float, max_pixels: int = MAX_PIXELS) -> NDArray[np.float32]:
-    """Read the depth (H, W) [m], 0 = no reading, of a 16-bit PNG in units of `depth_scale` [mm].
+    """Read the depth (H, W) [m], 0 = no reading, of a PNG or TIFF in units of `depth_scale` [mm].
 
     Raises:
-        InputError: Missing, truncated, too large, or not 16 bit.
+        InputError: Missing, truncated, too large, or neither 16 bit nor floating point.
     """
-    return (read_units(path, max_pixels=max_pixels) * (depth_scale / 1000.0)).astype(np.float32)
+    units = decode_image(
+        path, modes=(*DEPTH_MODES, "F"), what="a 16-bit grey PNG or TIFF", max_pixels=max_pixels
+    )
+    depth = (units.astype(np.float64) * (depth_scale / 1000.0)).astype(np.float32)
+    return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(0.0))
 
 
 def read_units(image: Path | bytes, name: str = "", max_pixels: int = MAX_PIXELS) -> NDArray[np.int32]:
@@ -58,7 +62,7 @@ def decode_image(
     what: str = "",
     max_pixels: int = MAX_PIXELS,
 ) -> NDArray[Any]:
-    """Decode a PNG or JPEG, a file or its content: (H, W), or (H, W, 3) if colour is allowed.
+    """Decode a PNG, JPEG or TIFF, a file or its content: (H, W), or (H, W, 3) if colour is allowed.
 
     Grey images then have three equal channels. Pillow's `modes` restrict it to `what` the error says.
 
@@ -126,7 +130,7 @@ def npy(array: NDArray[Any]) -> bytes:
 
 
 def _open(content: bytes) -> Image.Image:
-    return Image.open(io.BytesIO(content), formats=("PNG", "JPEG"))
+    return Image.open(io.BytesIO(content), formats=("PNG", "JPEG", "TIFF"))
 
 
 def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
@@ -55,7 +55,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     Raises:
         InputError: A list is missing or broken, or the camera is unknown.
     """
-    if options != OpenOptions(camera_file=options.camera_file):
+    if replace(options, camera_file=None, masks=True) != OpenOptions():
         remedy = f"{path} is a TUM RGB-D folder; omit them"
         raise InputError("--depth, --info, --rgb, --tf", "apply only to bags", remedy)
     file, size, note = _read_camera(path, options.camera_file)
