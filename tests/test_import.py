@@ -10,13 +10,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bag_files import (
+    BASE,
     DEPTH,
     INFO,
     LENS,
     RGB,
     SECOND,
     START,
+    T_BASE_LENS,
     WORLD,
+    BagFile,
     compressed_depth,
     jpeg,
     write_bag,
@@ -168,6 +171,81 @@ def test_lens_distortion_is_reported(tmp_path, views, capsys):
     assert "the lens has distortion" in capsys.readouterr().err
 
 
+def info_bag(tmp_path, view, topic, depth=None, D=(0.0,) * 5, **fields):
+    """A bag of one depth image whose camera info has these fields; K and D are those of another lens."""
+    with BagFile(tmp_path / "lens") as bag:
+        K = view.K * [[1.25], [1.25], [1.0]]
+        info = bag.camera(START, K, view.depth.shape[::-1], D=D)
+        info.p = np.column_stack([view.K, np.zeros(3)]).ravel()
+        for name, value in fields.items():
+            setattr(info, name, value)
+        bag.write(INFO, info, START)
+        bag.write(topic, bag.image(START, (view.depth if depth is None else depth), "32FC1"), START)
+    return tmp_path / "lens"
+
+
+BENT = (-0.3, 0.1, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("topic", "D", "P", "scale", "said"),
+    [
+        ("/depth/image_rect_raw", BENT, 1.0, 1.0, False),
+        ("/depth/image_rect/compressed", BENT, 1.0, 1.0, False),
+        ("/direct/depth", (0.0,) * 5, 1.0, 1.0, False),
+        ("/direct/depth", BENT, 1.0, 1.0, True),
+        ("/depth/image_rect", BENT, 0.0, 1.25, False),
+        ("/depth/image_raw", BENT, 1.0, 1.25, True),
+    ],
+)
+def test_the_camera_is_p_where_images_are_rectified_and_k_where_they_are_raw(
+    tmp_path, views, capsys, topic, D, P, scale, said
+):
+    P = np.column_stack([P * views[0].K, np.zeros(3)]).ravel()
+    (view,) = imported(
+        tmp_path, info_bag(tmp_path, views[0], topic, D=D, p=P), "--depth", topic, "--info", INFO
+    )
+    np.testing.assert_allclose(view.K, views[0].K * [[scale], [scale], [1.0]])
+    assert ("the lens has distortion" in capsys.readouterr().err) == said
+
+
+def test_binning_divides_the_camera_and_a_region_of_interest_shifts_it(tmp_path, views, unfit):
+    view = views[0]
+    part = {"x_offset": 40, "y_offset": 20, "width": 100, "height": 80}
+    with BagFile(tmp_path / "any") as bag:
+        bag.write("/any", bag.camera(START, view.K, (1, 1)), START)
+        region = bag.type("sensor_msgs/msg/RegionOfInterest")(**part, do_rectify=False)
+    depth = view.depth[20:100:2, 40:140:2]
+    bag = info_bag(tmp_path, view, DEPTH, depth, roi=region, binning_x=2, binning_y=2)
+    (cut,) = imported(tmp_path, bag, *TOPICS)
+    np.testing.assert_allclose(cut.K, (view.K - [[0, 0, 40], [0, 0, 20], [0, 0, 0]]) / [[2], [2], [1]])
+    shutil.rmtree(bag)
+    bag = info_bag(tmp_path, view, DEPTH, binning_x=2, binning_y=2)
+    unfit(bag, *TOPICS, says="camera_info has binning 2 × 2: its images (80×60 pixels")
+
+
+def test_bags_of_the_realsense_sdk_have_no_frames_and_their_own_unit(tmp_path, views, capsys, unfit):
+    view, sensor = views[0], "/device_0/sensor_0"
+    depth, info, rgb = f"{sensor}/Depth_0/image/data", f"{sensor}/Depth_0/info/camera_info", "/rgb"
+    other = "/device_0/sensor_1/Color_0/image/data"
+    with BagFile(tmp_path / "viewer.bag") as bag:
+        unit = bag.type("std_msgs/msg/Float32")(data=np.float32(0.00025))
+        bag.write(f"{sensor}/option/Depth_Units/value", unit, START)
+        bag.write(info, bag.camera(0, view.K, view.depth.shape[::-1], frame=""), START)
+        units = np.rint(view.depth / 0.00025).astype(np.uint16)
+        bag.write(depth, bag.image(START, units, "mono16", frame="0"), START)
+        for topic in (rgb, other):
+            bag.write(topic, bag.image(START, view.rgb, "rgb8", frame="0"), START)
+        bag.write("/tf_static", bag.transform(START, WORLD, LENS, np.eye(4)), START)
+    topics = (tmp_path / "viewer.bag", "--depth", depth, "--info", info)
+    (read,) = imported(tmp_path, *topics, "--rgb", rgb)
+    assert np.abs(read.depth - view.depth).max() < 0.00018
+    assert "units of 0.00025 m" in capsys.readouterr().err
+    said = "/device_0/sensor_0 is not registered to the colour of another sensor, /device_0/sensor_1"
+    unfit(*topics, "--rgb", other, says=said)
+    unfit(*topics, "--tf", WORLD, says="frame_id is empty")
+
+
 # What is left out is counted
 
 
@@ -225,6 +303,47 @@ def test_dark_blurred_and_equal_frames_are_counted(tmp_path, views, capsys):
 )  # fmt: skip
 def test_options_that_do_not_fit_the_bag_are_refused(tmp_path, views, unfit, options, said):
     unfit(bag_of(tmp_path, views), *options, says=said)
+
+
+def tf_bag(path, views, *fixed, late=0):
+    """A bag with transforms of its own: fixed ones, and the base in the world, later by a time [ns]."""
+    with BagFile(path) as bag:
+        for parent, child, T in fixed:
+            bag.write("/tf_static", bag.transform(START, parent, child, T), START)
+        for index, view in enumerate(views):
+            time = START + index * SECOND
+            T = view.T_world_camera @ transforms.invert(T_BASE_LENS)
+            for when in (time, time + SECOND // 100):
+                bag.write("/tf", bag.transform(when + late, WORLD, BASE, T), when)
+            bag.write(INFO, bag.camera(time, view.K, view.depth.shape[::-1]), time)
+            bag.write(DEPTH, bag.image(time, view.depth, "32FC1"), time)
+    return path
+
+
+MOUNT, DRIVER = (BASE, LENS, T_BASE_LENS), ("camera_link", LENS, np.eye(4))
+TF = (*TOPICS, "--tf", WORLD)
+
+
+@pytest.mark.parametrize("fixed", [(MOUNT, DRIVER), (DRIVER, MOUNT)])
+def test_of_two_parents_the_one_in_the_world_is_used_whatever_the_order(tmp_path, views, capsys, fixed):
+    read = imported(tmp_path, tf_bag(tmp_path / "tf.bag", views, *fixed), *TF)
+    for view, before in zip(read, views, strict=True):
+        assert np.allclose(view.T_world_camera, before.T_world_camera, atol=1e-6)
+    assert "'base' leads to 'map' and is used, 'camera_link' does not" in capsys.readouterr().err
+
+
+def test_transforms_that_contradict_each_other_do_not_meet_or_have_another_clock(tmp_path, views, unfit):
+    shifted = transforms.rigid(np.eye(3), (0.0, 0.0, 0.02))
+    loop = [(BASE, "camera_link", T_BASE_LENS @ shifted), MOUNT, DRIVER]
+    said = "frame 'optical' has two parents, 'base' and 'camera_link', that place it differently"
+    for number, fixed in enumerate((loop, loop[::-1])):
+        unfit(tf_bag(tmp_path / f"{number}.bag", views, *fixed), *TF, says=said)
+    loop[0] = (BASE, "camera_link", T_BASE_LENS)
+    assert len(imported(tmp_path, tf_bag(tmp_path / "same.bag", views, *loop), *TF)) == 3
+    said = "no transform connects 'map' with 'optical': the roots are 'map' and 'camera_link'"
+    unfit(tf_bag(tmp_path / "apart.bag", views, DRIVER), *TF, says=said)
+    said = "transforms of 'base' share no time: the former begin 3600.0 s earlier"
+    unfit(tf_bag(tmp_path / "late.bag", views, MOUNT, late=3600 * SECOND), *TF, says=said)
 
 
 def depth_of(make):

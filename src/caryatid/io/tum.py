@@ -65,20 +65,20 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     depths = _read_list(path / "depth.txt", partial(images.read_depth, depth_scale=file.depth_scale, **limit))
     decode = partial(images.decode_image, **limit)
     colours = _read_list(path / "rgb.txt", decode) if (path / "rgb.txt").is_file() else None
-    pose_at, notes = None, [note]
+    tree, notes = TransformTree(config.pose_gap), [note]
     poses = path / "groundtruth.txt"
     if poses.is_file():
-        tree = TransformTree(config.pose_gap)
         for time, words in _read_rows(poses, 8):
             with suppress(ValueError):
                 if is_pose(pose := [float(word) for word in words]):
                     tree.add(_WORLD, _CAMERA, time, pose)
                     continue
             raise _broken(poses, f"'{' '.join(words)}' is not a pose")
-        pose_at = partial(tree.between, _WORLD)
     else:
         notes.append("no groundtruth.txt: poses are unknown, so only one frame is imported")
-    return make_video(path, depths, colours, [camera], pose_at, config, notes)
+    return make_video(
+        path, depths, colours, [camera], (tree, _WORLD) if poses.is_file() else None, config, notes
+    )
 
 
 def _read_camera(folder: Path, camera_file: Path | None) -> tuple[_CameraFile, tuple[int, int] | None, str]:
