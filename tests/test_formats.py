@@ -358,6 +358,44 @@ def test_odd_but_honest_files_are_read(tmp_path):
     assert mesh.labels is None
 
 
+PADDED = {"FIELDS": "x y z _ rgba _ label _", "SIZE": "4 4 4 1 4 1 4 2", "TYPE": "F F F U U U U U"}
+PADDED |= {"COUNT": "1 1 1 4 1 0 1 2"}
+
+
+@pytest.mark.parametrize("encoding", ["binary", "binary_compressed", "stored"])
+@pytest.mark.parametrize("version", [".5", "0.6", None])
+def test_clouds_of_pcl_with_padding_of_any_version_and_not_shrunk_are_read(tmp_path, encoding, version):
+    data = plane(a="V4", rgba="<u4", b="V4")
+    data["rgba"] = 0xFF0A141E
+    order = ["x", "y", "z", "a", "rgba", "label", "b"]
+    padded = np.zeros(60, [(name, data.dtype[name]) for name in order])
+    for name in order:
+        padded[name] = data[name]
+    content = body(padded, encoding)
+    if encoding == "stored":
+        columns = b"".join(np.ascontiguousarray(padded[name]).tobytes() for name in order)
+        encoding, content = "binary_compressed", struct.pack("<II", len(columns), len(columns)) + columns
+    path = tmp_path / "a.pcd"
+    path.write_bytes(header(padded, encoding, VERSION=version, VIEWPOINT=None, **PADDED).encode() + content)
+    stored = read_stored_cloud(path)
+    assert np.array_equal(stored.points, np.stack([data[axis] for axis in "xyz"], axis=-1))
+    assert np.array_equal(stored.labels, data["label"])
+    assert (stored.rgb == (10, 20, 30)).all()
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_doubles_of_either_byte_order_are_read_whatever_follows_the_points(tmp_path, order):
+    points, names = np.random.default_rng(0).normal(size=(4, 3)), ("little", "big")
+    lines = [f"format binary_{names[order == '>']}_endian 1.0", "element vertex 4"]
+    lines += [f"property double {axis}" for axis in "xyz"]
+    lines += ["element face 2", "property list uchar int vertex_indices", "element camera 1"]
+    lines += ["property float view_px", "end_header", ""]
+    faces = struct.pack(f"{order}B3iB4i", 3, 0, 1, 2, 4, 0, 1, 2, 3)
+    content = points.astype(f"{order}f8").tobytes() + faces + struct.pack(f"{order}f", 0.5)
+    (tmp_path / "a.ply").write_bytes("\n".join(["ply", *lines]).encode() + content)
+    assert np.array_equal(read_stored_cloud(tmp_path / "a.ply").points, points)
+
+
 GIGABYTES = struct.pack("<II", 100, 10**8 * plane().itemsize) + bytes(100)
 
 
