@@ -29,6 +29,7 @@ from conftest import run_command
 from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from synthetic import random_motion
 
@@ -409,6 +410,26 @@ def test_a_folder_of_the_benchmark_becomes_the_views_it_holds(tmp_path, views):
     folder = tum_folder(tmp_path, views)
     recording = imported(tmp_path, folder, "--camera", camera_file(tmp_path, views[0].K))
     same_views(recording, views, atol=0.00011)
+
+
+def test_lists_as_others_write_them_and_another_unit_of_depth(tmp_path, views, refused):
+    folder = tum_folder(tmp_path, views)
+    for name, first in (
+        ("depth", "timestamp,filename"),
+        ("rgb", ""),
+        ("groundtruth", "#time x y z and more"),
+    ):
+        rows = (folder / f"{name}.txt").read_text().splitlines()[2:]
+        lines = [first, *(f"{', '.join(row.split())}, 7" for row in rows)]
+        (folder / f"{name}.txt").write_text("\n".join(lines))
+    for path in (folder / "depth").iterdir():
+        Image.fromarray((np.array(Image.open(path)) // 5).astype(np.uint16)).save(path)
+    camera = camera_file(tmp_path, views[0].K)
+    values = json.loads(camera.read_text())
+    camera.write_text(json.dumps(values | {"depth_scale": 1.0}))
+    same_views(imported(tmp_path, folder, "--camera", camera), views, atol=0.0011)
+    camera.write_text(json.dumps(values | {"depth_scale": 1000.0}))
+    refused("import", folder, "--camera", camera, names="camera.json", says="0.2 if 5000 are a metre")
 
 
 @pytest.mark.parametrize(("number", "fx"), [(1, 517.3), (2, 520.9), (3, 535.4)])
