@@ -347,6 +347,36 @@ def test_transforms_that_contradict_each_other_do_not_meet_or_have_another_clock
     unfit(tf_bag(tmp_path / "late.bag", views, MOUNT, late=3600 * SECOND), *TF, says=said)
 
 
+def test_two_cameras_of_one_bag_and_two_recordings_of_one_scene(tmp_path, views, capsys, unfit):
+    path, flags = tmp_path / "two.bag", []
+    with BagFile(path) as bag:
+        for number, view in enumerate(views[:2]):
+            frame, depth, info = f"eye{number}", f"/{number}/depth", f"/{number}/info"
+            flags += ["--depth", depth, "--info", info]
+            bag.write("/tf_static", bag.transform(START, WORLD, frame, view.T_world_camera), START)
+            for time in (START, START + SECOND):
+                bag.write(info, bag.camera(time, view.K, view.depth.shape[::-1], frame=frame), time)
+                bag.write(depth, bag.image(time + number, view.depth, "32FC1", frame=frame), time)
+    document = summary(tmp_path, capsys, path, *flags, "--tf", WORLD)
+    assert document["frames"] == 4
+    both = read_recording(tmp_path / "out")
+    unfit(path, *flags, says="has no camera poses, so it cannot be joined with others")
+    unfit(path, *flags[:6], "--tf", WORLD, says="--info: is given for 1 of 2 cameras")
+    for number in (0, 1):
+        options = (*flags[4 * number : 4 * number + 4], "--tf", WORLD, "--out", tmp_path / f"eye{number}")
+        assert run_command("import", path, *options) == 0
+    alone = [str(tmp_path / f"eye{number}") for number in (0, 1)]
+    joined = open_recording(alone[0], Config(), None, more=alone[1:])
+    assert [view.name for view in joined] == ["eye0+eye1/000000", "eye0+eye1/000001"]
+    for read in (both, joined):
+        for view, before in zip(read, views[:2], strict=True):
+            assert np.allclose(view.depth, before.depth, atol=0.0001)
+            assert np.allclose(view.T_world_camera, before.T_world_camera, atol=1e-6)
+    options = ("--out", tmp_path / "run", "--no-report", "--segmentation", "auto")
+    assert run_command("extract", *alone, *options) == 0
+    assert json.loads((tmp_path / "run/run.json").read_text())["options"]["more"] == alone[1:]
+
+
 def depth_of(make):
     return {"depth": lambda bag, time: make(bag, time, np.full((120, 160), 90, np.uint8))}
 
