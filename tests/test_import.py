@@ -333,7 +333,9 @@ def test_of_two_parents_the_one_in_the_world_is_used_whatever_the_order(tmp_path
     assert "'base' leads to 'map' and is used, 'camera_link' does not" in capsys.readouterr().err
 
 
-def test_transforms_that_contradict_each_other_do_not_meet_or_have_another_clock(tmp_path, views, unfit):
+def test_transforms_that_contradict_each_other_do_not_meet_or_have_another_clock(
+    tmp_path, views, capsys, unfit
+):
     shifted = transforms.rigid(np.eye(3), (0.0, 0.0, 0.02))
     loop = [(BASE, "camera_link", T_BASE_LENS @ shifted), MOUNT, DRIVER]
     said = "frame 'optical' has two parents, 'base' and 'camera_link', that place it differently"
@@ -343,6 +345,10 @@ def test_transforms_that_contradict_each_other_do_not_meet_or_have_another_clock
     assert len(imported(tmp_path, tf_bag(tmp_path / "same.bag", views, *loop), *TF)) == 3
     said = "no transform connects 'map' with 'optical': the roots are 'map' and 'camera_link'"
     unfit(tf_bag(tmp_path / "apart.bag", views, DRIVER), *TF, says=said)
+    moved = tf_bag(tmp_path / "moved.bag", views, (BASE, LENS, T_BASE_LENS @ shifted), MOUNT)
+    shutil.rmtree(tmp_path / "out")
+    assert np.allclose(imported(tmp_path, moved, *TF)[0].T_world_camera, views[0].T_world_camera, atol=1e-6)
+    assert "'optical' has several fixed poses in 'base'; the last is used" in capsys.readouterr().err
     said = "transforms of 'base' share no time: the former begin 3600.0 s earlier"
     unfit(tf_bag(tmp_path / "late.bag", views, MOUNT, late=3600 * SECOND), *TF, says=said)
 
@@ -494,6 +500,10 @@ def spoil(name, text):
         (spoil("groundtruth.txt", b"1.0 0 0 0 0 0 0 one\n"), "is not a pose"),
         (spoil("groundtruth.txt", b"# none\n"), "none of its 3 depth images is usable: 3 no pose"),
         (spoil("rgb.txt", b"# none\n"), "3 no colour image at that time"),
+        (
+            spoil("rgb.txt", b"1305031000.0 rgb/x.png\n"),
+            "colour images share no time: the former begin 102.2 s",
+        ),
         (lambda folder: shutil.rmtree(folder / "depth"), "3 broken"),
     ],
 )

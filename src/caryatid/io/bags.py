@@ -105,6 +105,10 @@ def _check_way(tree: TransformTree, path: Path, frame: str, world: str) -> list[
     for child in above:
         lost = [parent for parent in tree.parents(child) if reached.isdisjoint(tree.ancestors(parent))]
         used = [parent for parent in tree.parents(child) if parent not in lost]
+        if child in tree.moved:
+            notes.append(
+                f"frame '{child}' has several fixed poses in '{tree.moved[child]}'; the last is used"
+            )
         if lost and used:
             words = f"frame '{child}' has several parents: '{used[0]}' leads to '{world}' and is used"
             notes.append(f"{words}, '{lost[0]}' does not")

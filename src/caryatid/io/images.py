@@ -25,7 +25,16 @@ MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
 """Pillow modes of depth images, and of masks."""
 MAX_PIXELS: Final = RecordingConfig().max_pixels
 """Default of the maximum number of pixels."""
-_BAD_BYTES: Final = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, zlib.error)
+_BAD_BYTES: Final = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    EOFError,
+    IndexError,
+    struct.error,
+    zlib.error,
+)
 """Exceptions of Pillow for a broken image."""
 
 
@@ -62,7 +71,7 @@ def decode_image(
     what: str = "",
     max_pixels: int = MAX_PIXELS,
 ) -> NDArray[Any]:
-    """Decode a PNG, JPEG or TIFF, a file or its content: (H, W), or (H, W, 3) if colour is allowed.
+    """Decode a PNG or JPEG, a file or its content, or a TIFF file: (H, W), or (H, W, 3) if colour is allowed.
 
     Grey images then have three equal channels. Pillow's `modes` restrict it to `what` the error says.
 
@@ -72,12 +81,13 @@ def decode_image(
     source, remedy = image if isinstance(image, Path) else name, "copy or record the file again"
     try:
         content = image.read_bytes() if isinstance(image, Path) else image
+        formats = ("PNG", "JPEG", "TIFF") if isinstance(image, Path) else ("PNG", "JPEG")
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with _open(content) as whole:
+            with Image.open(io.BytesIO(content), formats=formats) as whole:
                 if whole.format == "PNG":
                     whole.verify()  # decoding ignores a wrong checksum or a missing end
-            with _open(content) as opened:
+            with Image.open(io.BytesIO(content), formats=formats) as opened:
                 width, height = opened.size
                 if modes is not None and opened.mode not in modes:
                     reason = f"has pixels of mode {opened.mode}, not {what}"
@@ -127,10 +137,6 @@ def npy(array: NDArray[Any]) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
     return buffer.getvalue()
-
-
-def _open(content: bytes) -> Image.Image:
-    return Image.open(io.BytesIO(content), formats=("PNG", "JPEG", "TIFF"))
 
 
 def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:

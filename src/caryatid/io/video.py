@@ -181,6 +181,9 @@ class TransformTree:
     """Poses of frames in their parents over time, interpolated across gaps of at most `max_gap` [s].
 
     A frame may have several parents, as when a driver and a calibration both publish it. Errors use the name.
+
+    Attributes:
+        moved: Frames that have several fixed poses in the same parent, and that parent.
     """
 
     def __init__(self, max_gap: float, name: str = "transforms") -> None:
@@ -188,6 +191,7 @@ class TransformTree:
         self._max_gap = round(max_gap * SECOND)
         self._fixed: defaultdict[str, dict[str, Array]] = defaultdict(dict)
         self._links: defaultdict[str, dict[str, _Link]] = defaultdict(dict)
+        self.moved: dict[str, str] = {}
 
     @property
     def frames(self) -> list[str]:
@@ -207,7 +211,10 @@ class TransformTree:
         """
         if fixed:
             rotation = Rotation.from_quat(pose[3:]).as_matrix()
-            self._fixed[child][parent] = transforms.rigid(rotation, pose[:3])
+            T_parent_child = transforms.rigid(rotation, pose[:3])
+            if not np.allclose(T_parent_child, self._fixed[child].get(parent, T_parent_child), atol=1e-3):
+                self.moved[child] = parent
+            self._fixed[child][parent] = T_parent_child
             return
         link = self._links[child].setdefault(parent, _Link())
         link.times.append(time)
