@@ -62,14 +62,14 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     depth_topic = bag.require("--depth", options.depth, "images")
     info_topic = bag.require("--info", options.info, "cameras")
     rgb_topic = None if options.rgb is None else bag.require("--rgb", options.rgb, "images")
-    sensors = [found[0] for topic in (depth_topic, rgb_topic or "") if (found := _REALSENSE.match(topic))]
-    if len(set(sensors)) > 1:
-        reason = f"depth of {sensors[0]} is not registered to the colour of another sensor, {sensors[1]}"
+    sensor, other = _REALSENSE.match(depth_topic), _REALSENSE.match(rgb_topic or "")
+    if sensor and other and sensor[0] != other[0]:
+        reason = f"depth of {sensor[0]} is not registered to the colour of another sensor, {other[0]}"
         raise InputError(path, reason, "omit --rgb, or align depth to colour and record that")
     cameras, notes = _read_cameras(bag, info_topic, depth_topic)
-    unit = bag.depth_unit(sensors[0]) if sensors else 0.001
-    if unit != 0.001:
-        notes.append(f"{sensors[0]} counts depth in units of {unit:g} m (Depth_Units)")
+    unit = bag.depth_unit(sensor[0]) if sensor else 0.001
+    if sensor and unit != 0.001:
+        notes.append(f"{sensor[0]} counts depth in units of {unit:g} m (Depth_Units)")
     depths = bag.images(depth_topic, partial(decode_depth, max_pixels=config.max_pixels, unit=unit))
     colour = partial(decode_colour, max_pixels=config.max_pixels)
     colours = None if rgb_topic is None else bag.images(rgb_topic, colour)
@@ -106,9 +106,8 @@ def _check_way(tree: TransformTree, path: Path, frame: str, world: str) -> list[
         lost = [parent for parent in tree.parents(child) if reached.isdisjoint(tree.ancestors(parent))]
         used = [parent for parent in tree.parents(child) if parent not in lost]
         if child in tree.moved:
-            notes.append(
-                f"frame '{child}' has several fixed poses in '{tree.moved[child]}'; the last is used"
-            )
+            words = f"frame '{child}' has several fixed poses in '{tree.moved[child]}'"
+            notes.append(f"{words}; the last is used")
         if lost and used:
             words = f"frame '{child}' has several parents: '{used[0]}' leads to '{world}' and is used"
             notes.append(f"{words}, '{lost[0]}' does not")

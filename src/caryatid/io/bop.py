@@ -100,8 +100,9 @@ def read_recording(
     cameras = parse_json(dict[int, _Camera], read_json(path, remedy), path, remedy)
     if not cameras:
         raise InputError(folder, f"has no frames: {path.name} is empty", "give a recording with frames")
+    stems = {f"{number:06d}" for number in cameras}
     for image in sorted((folder / f"depth{end}").glob("*.*")):
-        if image.suffix in DEPTH_ENDINGS and image.stem not in {f"{number:06d}" for number in cameras}:
+        if image.suffix in DEPTH_ENDINGS and image.stem not in stems:
             remedy = "add its camera there, or delete the image"
             raise InputError(image, f"has no entry in {path.name}", remedy)
     known, most = _Masks({}), (config or RecordingConfig()).max_pixels
@@ -229,9 +230,7 @@ def _frame(
             labels, shared = _read_labels(masks, depth, max_pixels)
             if shared and not overlaps:  # frames are loaded several times, and one line is enough
                 overlaps.append(number)
-                said = (
-                    "%s: masks overlap, in frame %d in %d pixels; each such pixel goes to the smallest mask"
-                )
+                said = "%s: masks overlap, in frame %d in %d pixels; each goes to the smallest mask"
                 log.info(said, folder / f"mask_visib{end}", number, shared)
         return View(
             depth, K, T_world_camera, rgb, labels, name=name, labels_are=known.labels_are, names=names
@@ -307,12 +306,10 @@ def _read_masks(folder: Path, path: Path, frames: set[int]) -> _Masks:
     expected = {file for masks in table.values() for file, _ in masks}
     for image in files:
         if image not in expected:
-            raise InputError(
-                image, f"names no object: {path.name} has no entry for it", "add its obj_id there"
-            )
-    lost = sorted(expected.difference(files))
-    if lost:
-        notes.append(f"{len(lost)} of {len(expected)} masks are left out: {lost[0]} is missing")
+            reason = f"names no object: {path.name} has no entry for it"
+            raise InputError(image, reason, "add its obj_id there")
+    if lost := expected.difference(files):
+        notes.append(f"{len(lost)} of {len(expected)} masks are left out: {min(lost)} is missing")
         table = {frame: [m for m in masks if m[0] not in lost] for frame, masks in table.items()}
     if not files:
         return _Masks({}, notes=tuple(notes))
