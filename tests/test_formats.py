@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import shutil
 import struct
 from dataclasses import asdict
 
@@ -27,6 +28,7 @@ from caryatid.io import (
     graph_from_json,
     graph_text,
     graph_to_json,
+    open_dataset,
     read_graph,
     read_recording,
     read_stored_cloud,
@@ -356,6 +358,44 @@ def test_odd_but_honest_files_are_read(tmp_path):
     assert mesh.labels is None
 
 
+PADDED = {"FIELDS": "x y z _ rgba _ label _", "SIZE": "4 4 4 1 4 1 4 2", "TYPE": "F F F U U U U U"}
+PADDED |= {"COUNT": "1 1 1 4 1 0 1 2"}
+
+
+@pytest.mark.parametrize("encoding", ["binary", "binary_compressed", "stored"])
+@pytest.mark.parametrize("version", [".5", "0.6", None])
+def test_clouds_of_pcl_with_padding_of_any_version_and_not_shrunk_are_read(tmp_path, encoding, version):
+    data = plane(a="V4", rgba="<u4", b="V4")
+    data["rgba"] = 0xFF0A141E
+    order = ["x", "y", "z", "a", "rgba", "label", "b"]
+    padded = np.zeros(60, [(name, data.dtype[name]) for name in order])
+    for name in order:
+        padded[name] = data[name]
+    content = body(padded, encoding)
+    if encoding == "stored":
+        columns = b"".join(np.ascontiguousarray(padded[name]).tobytes() for name in order)
+        encoding, content = "binary_compressed", struct.pack("<II", len(columns), len(columns)) + columns
+    path = tmp_path / "a.pcd"
+    path.write_bytes(header(padded, encoding, VERSION=version, VIEWPOINT=None, **PADDED).encode() + content)
+    stored = read_stored_cloud(path)
+    assert np.array_equal(stored.points, np.stack([data[axis] for axis in "xyz"], axis=-1))
+    assert np.array_equal(stored.labels, data["label"])
+    assert (stored.rgb == (10, 20, 30)).all()
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_doubles_of_either_byte_order_are_read_whatever_follows_the_points(tmp_path, order):
+    points, names = np.random.default_rng(0).normal(size=(4, 3)), ("little", "big")
+    lines = [f"format binary_{names[order == '>']}_endian 1.0", "element vertex 4"]
+    lines += [f"property double {axis}" for axis in "xyz"]
+    lines += ["element face 2", "property list uchar int vertex_indices", "element camera 1"]
+    lines += ["property float view_px", "end_header", ""]
+    faces = struct.pack(f"{order}B3iB4i", 3, 0, 1, 2, 4, 0, 1, 2, 3)
+    content = points.astype(f"{order}f8").tobytes() + faces + struct.pack(f"{order}f", 0.5)
+    (tmp_path / "a.ply").write_bytes("\n".join(["ply", *lines]).encode() + content)
+    assert np.array_equal(read_stored_cloud(tmp_path / "a.ply").points, points)
+
+
 GIGABYTES = struct.pack("<II", 100, 10**8 * plane().itemsize) + bytes(100)
 
 
@@ -489,6 +529,67 @@ def test_an_empty_mask_is_an_object_out_of_sight(folder):
     assert set(np.unique(read_recording(folder)[0].labels)) == {0, 7}
 
 
+def test_masks_of_one_model_or_without_a_table_are_segments_of_their_view(tmp_path, folder):
+    first = read_recording(folder)[0].labels
+    (folder / "names.json").write_text('{"300": "cup"}')
+    spoil(folder, "scene_gt.json", "1", 0, "obj_id", 300)
+    repeated = read_recording(folder)
+    assert "two masks of frame 1 have obj_id 300, so masks are segments" in repeated.notes[0]
+    for view, names in zip(repeated, ({2: "cup"}, {1: "cup", 2: "cup"}, {2: "cup"}), strict=True):
+        assert view.labels_are == "segments"
+        assert view.names == names
+        assert (view.labels == np.select([first == 7, first == 300], [1, 2])).all()
+    write_recording(tmp_path / "again", repeated)
+    for path in (tmp_path / "again", folder):
+        (path / "scene_gt.json").unlink(missing_ok=True)
+        (unknown, *_), (seen, *_) = read_recording(path), repeated
+        assert (unknown.labels_are, unknown.names) == ("segments", {} if path == folder else None)
+        assert (unknown.labels == seen.labels).all()
+
+
+def test_of_masks_that_overlap_the_smallest_is_on_top_and_one_line_says_so(folder, caplog):
+    Image.new("L", (64, 48), 255).save(folder / "mask_visib/000001_000000.png")
+    with caplog.at_level("INFO"):
+        labels = [view.labels for view in (*read_recording(folder), *read_recording(folder, masks=False))]
+    assert ((labels[1] == 300) == (labels[0] == 300)).all()
+    assert (labels[1] != 0).all()
+    assert labels[3:] == [None] * 3
+    (line,) = caplog.messages
+    assert "overlap, in frame 1 in 80 pixels" in line
+
+
+def test_a_lost_mask_is_left_out_with_a_line(folder):
+    (folder / MASK).unlink()
+    read = read_recording(folder)
+    assert [set(np.unique(view.labels)) for view in read] == [{0, 7, 300}, {0, 7}, {0, 7, 300}]
+    assert "1 of 6 masks are left out:" in read.notes[0]
+    assert MASK in read.notes[0]
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.float32])
+def test_of_several_sensors_one_is_chosen_and_its_depth_may_be_a_tiff(folder, kind):
+    views = list(read_recording(folder))
+    for end in ("left", "right"):
+        for name in ("depth", "mask_visib"):
+            shutil.copytree(folder / name, folder / f"{name}_{end}")
+        for name in ("scene_camera", "scene_gt"):
+            shutil.copy(folder / f"{name}.json", folder / f"{name}_{end}.json")
+    for path in (folder / CAMERA, folder / "scene_gt.json"):
+        path.unlink()
+    for path in (folder / "depth_right").iterdir():
+        Image.fromarray(np.array(Image.open(path)).astype(kind)).save(path.with_suffix(".tif"))
+        path.unlink()
+    with refusal(folder, "2 of its sensors have depth: left, right", "depth_left"):
+        open_dataset(folder)
+    for read in (read_recording(folder / "depth_left"), open_dataset(folder / "depth_right")):
+        for view, before in zip(read, views, strict=True):
+            assert (view.name, view.rgb) == (before.name, None)
+            assert np.array_equal(view.depth, before.depth)
+            assert np.array_equal(view.labels, before.labels)
+    shutil.rmtree(folder / "depth_left")
+    assert len(read_recording(folder)) == 3
+
+
 @pytest.mark.parametrize(
     ("name", "where", "said"),
     [
@@ -498,7 +599,6 @@ def test_an_empty_mask_is_an_object_out_of_sight(folder):
             for share in (0.0, 0.3, 0.9)
         ),
         (MASK, (Image.new("L", (63, 48)),), "63×48 pixels, but the depth image has 64"),
-        (MASK, (Image.new("L", (64, 48), 255),), "overlaps the mask of obj_id 7 in"),
         ("depth/000002.png", (Image.new("L", (64, 48), 1),), "mode L, not a 16-bit grey PNG"),
         ("depth/000002.png", (Image.new("I;16", (64, 48)),), "the frame is empty"),
         (CAMERA, ("1", "cam_K", [1, 2]), "9 finite numbers"),
@@ -508,7 +608,6 @@ def test_an_empty_mask_is_an_object_out_of_sight(folder):
         (CAMERA, ("1", "cam_R_w2c", [0.0] * 9), "not a rotation"),
         (CAMERA, ("1", ...), "no entry in scene_camera.json"),
         (CAMERA, ("first", {}), "must be a valid integer"),
-        ("scene_gt.json", ("1", 0, "obj_id", 300), "two masks have obj_id 300"),
         ("scene_gt.json", ("1", {"obj_id": 1}), "must be a valid array"),
         ("scene_gt.json", ("8", []), "not in scene_camera.json"),
         ("scene_gt.json", ("1", -1, ...), "names no object"),
@@ -535,7 +634,7 @@ def test_what_is_missing_or_cannot_be_written_is_said_and_leaves_nothing(tmp_pat
     with pytest.raises(InputError, match="already exists"):
         write_recording(folder, make_views())
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
-    for name in (MASK, "rgb/000001.png", "depth/000001.png"):
+    for name in ("rgb/000001.png", "depth/000001.png"):
         (folder / name).unlink()
         with refusal(folder, name, "missing"):
             list(read_recording(folder))

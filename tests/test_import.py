@@ -10,13 +10,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bag_files import (
+    BASE,
     DEPTH,
     INFO,
     LENS,
     RGB,
     SECOND,
     START,
+    T_BASE_LENS,
     WORLD,
+    BagFile,
     compressed_depth,
     jpeg,
     write_bag,
@@ -26,6 +29,7 @@ from conftest import run_command
 from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from synthetic import random_motion
 
@@ -168,6 +172,81 @@ def test_lens_distortion_is_reported(tmp_path, views, capsys):
     assert "the lens has distortion" in capsys.readouterr().err
 
 
+def info_bag(tmp_path, view, topic, depth=None, D=(0.0,) * 5, **fields):
+    """A bag of one depth image whose camera info has these fields; K and D are those of another lens."""
+    with BagFile(tmp_path / "lens") as bag:
+        K = view.K * [[1.25], [1.25], [1.0]]
+        info = bag.camera(START, K, view.depth.shape[::-1], D=D)
+        info.p = np.column_stack([view.K, np.zeros(3)]).ravel()
+        for name, value in fields.items():
+            setattr(info, name, value)
+        bag.write(INFO, info, START)
+        bag.write(topic, bag.image(START, (view.depth if depth is None else depth), "32FC1"), START)
+    return tmp_path / "lens"
+
+
+BENT = (-0.3, 0.1, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("topic", "D", "P", "scale", "said"),
+    [
+        ("/depth/image_rect_raw", BENT, 1.0, 1.0, False),
+        ("/depth/image_rect/compressed", BENT, 1.0, 1.0, False),
+        ("/direct/depth", (0.0,) * 5, 1.0, 1.0, False),
+        ("/direct/depth", BENT, 1.0, 1.0, True),
+        ("/depth/image_rect", BENT, 0.0, 1.25, False),
+        ("/depth/image_raw", BENT, 1.0, 1.25, True),
+    ],
+)
+def test_the_camera_is_p_where_images_are_rectified_and_k_where_they_are_raw(
+    tmp_path, views, capsys, topic, D, P, scale, said
+):
+    P = np.column_stack([P * views[0].K, np.zeros(3)]).ravel()
+    (view,) = imported(
+        tmp_path, info_bag(tmp_path, views[0], topic, D=D, p=P), "--depth", topic, "--info", INFO
+    )
+    np.testing.assert_allclose(view.K, views[0].K * [[scale], [scale], [1.0]])
+    assert ("the lens has distortion" in capsys.readouterr().err) == said
+
+
+def test_binning_divides_the_camera_and_a_region_of_interest_shifts_it(tmp_path, views, unfit):
+    view = views[0]
+    part = {"x_offset": 40, "y_offset": 20, "width": 100, "height": 80}
+    with BagFile(tmp_path / "any") as bag:
+        bag.write("/any", bag.camera(START, view.K, (1, 1)), START)
+        region = bag.type("sensor_msgs/msg/RegionOfInterest")(**part, do_rectify=False)
+    depth = view.depth[20:100:2, 40:140:2]
+    bag = info_bag(tmp_path, view, DEPTH, depth, roi=region, binning_x=2, binning_y=2)
+    (cut,) = imported(tmp_path, bag, *TOPICS)
+    np.testing.assert_allclose(cut.K, (view.K - [[0, 0, 40], [0, 0, 20], [0, 0, 0]]) / [[2], [2], [1]])
+    shutil.rmtree(bag)
+    bag = info_bag(tmp_path, view, DEPTH, binning_x=2, binning_y=2)
+    unfit(bag, *TOPICS, says="camera_info has binning 2 × 2: its images (80×60 pixels")
+
+
+def test_bags_of_the_realsense_sdk_have_no_frames_and_their_own_unit(tmp_path, views, capsys, unfit):
+    view, sensor = views[0], "/device_0/sensor_0"
+    depth, info, rgb = f"{sensor}/Depth_0/image/data", f"{sensor}/Depth_0/info/camera_info", "/rgb"
+    other = "/device_0/sensor_1/Color_0/image/data"
+    with BagFile(tmp_path / "viewer.bag") as bag:
+        unit = bag.type("std_msgs/msg/Float32")(data=np.float32(0.00025))
+        bag.write(f"{sensor}/option/Depth_Units/value", unit, START)
+        bag.write(info, bag.camera(0, view.K, view.depth.shape[::-1], frame=""), START)
+        units = np.rint(view.depth / 0.00025).astype(np.uint16)
+        bag.write(depth, bag.image(START, units, "mono16", frame="0"), START)
+        for topic in (rgb, other):
+            bag.write(topic, bag.image(START, view.rgb, "rgb8", frame="0"), START)
+        bag.write("/tf_static", bag.transform(START, WORLD, LENS, np.eye(4)), START)
+    topics = (tmp_path / "viewer.bag", "--depth", depth, "--info", info)
+    (read,) = imported(tmp_path, *topics, "--rgb", rgb)
+    assert np.abs(read.depth - view.depth).max() < 0.00018
+    assert "units of 0.00025 m" in capsys.readouterr().err
+    said = "/device_0/sensor_0 is not registered to the colour of another sensor, /device_0/sensor_1"
+    unfit(*topics, "--rgb", other, says=said)
+    unfit(*topics, "--tf", WORLD, says="frame_id is empty")
+
+
 # What is left out is counted
 
 
@@ -225,6 +304,83 @@ def test_dark_blurred_and_equal_frames_are_counted(tmp_path, views, capsys):
 )  # fmt: skip
 def test_options_that_do_not_fit_the_bag_are_refused(tmp_path, views, unfit, options, said):
     unfit(bag_of(tmp_path, views), *options, says=said)
+
+
+def tf_bag(path, views, *fixed, late=0):
+    """A bag with transforms of its own: fixed ones, and the base in the world, later by a time [ns]."""
+    with BagFile(path) as bag:
+        for parent, child, T in fixed:
+            bag.write("/tf_static", bag.transform(START, parent, child, T), START)
+        for index, view in enumerate(views):
+            time = START + index * SECOND
+            T = view.T_world_camera @ transforms.invert(T_BASE_LENS)
+            for when in (time, time + SECOND // 100):
+                bag.write("/tf", bag.transform(when + late, WORLD, BASE, T), when)
+            bag.write(INFO, bag.camera(time, view.K, view.depth.shape[::-1]), time)
+            bag.write(DEPTH, bag.image(time, view.depth, "32FC1"), time)
+    return path
+
+
+MOUNT, DRIVER = (BASE, LENS, T_BASE_LENS), ("camera_link", LENS, np.eye(4))
+TF = (*TOPICS, "--tf", WORLD)
+
+
+@pytest.mark.parametrize("fixed", [(MOUNT, DRIVER), (DRIVER, MOUNT)])
+def test_of_two_parents_the_one_in_the_world_is_used_whatever_the_order(tmp_path, views, capsys, fixed):
+    read = imported(tmp_path, tf_bag(tmp_path / "tf.bag", views, *fixed), *TF)
+    for view, before in zip(read, views, strict=True):
+        assert np.allclose(view.T_world_camera, before.T_world_camera, atol=1e-6)
+    assert "'base' leads to 'map' and is used, 'camera_link' does not" in capsys.readouterr().err
+
+
+def test_transforms_that_contradict_each_other_do_not_meet_or_have_another_clock(
+    tmp_path, views, capsys, unfit
+):
+    shifted = transforms.rigid(np.eye(3), (0.0, 0.0, 0.02))
+    loop = [(BASE, "camera_link", T_BASE_LENS @ shifted), MOUNT, DRIVER]
+    said = "frame 'optical' has two parents, 'base' and 'camera_link', that place it differently"
+    for number, fixed in enumerate((loop, loop[::-1])):
+        unfit(tf_bag(tmp_path / f"{number}.bag", views, *fixed), *TF, says=said)
+    loop[0] = (BASE, "camera_link", T_BASE_LENS)
+    assert len(imported(tmp_path, tf_bag(tmp_path / "same.bag", views, *loop), *TF)) == 3
+    said = "no transform connects 'map' with 'optical': the roots are 'map' and 'camera_link'"
+    unfit(tf_bag(tmp_path / "apart.bag", views, DRIVER), *TF, says=said)
+    moved = tf_bag(tmp_path / "moved.bag", views, (BASE, LENS, T_BASE_LENS @ shifted), MOUNT)
+    shutil.rmtree(tmp_path / "out")
+    assert np.allclose(imported(tmp_path, moved, *TF)[0].T_world_camera, views[0].T_world_camera, atol=1e-6)
+    assert "'optical' has several fixed poses in 'base'; the last is used" in capsys.readouterr().err
+    said = "transforms of 'base' share no time: the former begin 3600.0 s earlier"
+    unfit(tf_bag(tmp_path / "late.bag", views, MOUNT, late=3600 * SECOND), *TF, says=said)
+
+
+def test_two_cameras_of_one_bag_and_two_recordings_of_one_scene(tmp_path, views, capsys, unfit):
+    path, flags = tmp_path / "two.bag", []
+    with BagFile(path) as bag:
+        for number, view in enumerate(views[:2]):
+            frame, depth, info = f"eye{number}", f"/{number}/depth", f"/{number}/info"
+            flags += ["--depth", depth, "--info", info]
+            bag.write("/tf_static", bag.transform(START, WORLD, frame, view.T_world_camera), START)
+            for time in (START, START + SECOND):
+                bag.write(info, bag.camera(time, view.K, view.depth.shape[::-1], frame=frame), time)
+                bag.write(depth, bag.image(time + number, view.depth, "32FC1", frame=frame), time)
+    document = summary(tmp_path, capsys, path, *flags, "--tf", WORLD)
+    assert document["frames"] == 4
+    both = read_recording(tmp_path / "out")
+    unfit(path, *flags, says="has no camera poses, so it cannot be joined with others")
+    unfit(path, *flags[:6], "--tf", WORLD, says="--info: is given for 1 of 2 cameras")
+    for number in (0, 1):
+        options = (*flags[4 * number : 4 * number + 4], "--tf", WORLD, "--out", tmp_path / f"eye{number}")
+        assert run_command("import", path, *options) == 0
+    alone = [str(tmp_path / f"eye{number}") for number in (0, 1)]
+    joined = open_recording(alone[0], Config(), None, more=alone[1:])
+    assert [view.name for view in joined] == ["eye0+eye1/000000", "eye0+eye1/000001"]
+    for read in (both, joined):
+        for view, before in zip(read, views[:2], strict=True):
+            assert np.allclose(view.depth, before.depth, atol=0.0001)
+            assert np.allclose(view.T_world_camera, before.T_world_camera, atol=1e-6)
+    options = ("--out", tmp_path / "run", "--no-report", "--segmentation", "auto")
+    assert run_command("extract", *alone, *options) == 0
+    assert json.loads((tmp_path / "run/run.json").read_text())["options"]["more"] == alone[1:]
 
 
 def depth_of(make):
@@ -292,6 +448,26 @@ def test_a_folder_of_the_benchmark_becomes_the_views_it_holds(tmp_path, views):
     same_views(recording, views, atol=0.00011)
 
 
+def test_lists_as_others_write_them_and_another_unit_of_depth(tmp_path, views, refused):
+    folder = tum_folder(tmp_path, views)
+    for name, first in (
+        ("depth", "timestamp,filename"),
+        ("rgb", ""),
+        ("groundtruth", "#time x y z and more"),
+    ):
+        rows = (folder / f"{name}.txt").read_text().splitlines()[2:]
+        lines = [first, *(f"{', '.join(row.split())}, 7" for row in rows)]
+        (folder / f"{name}.txt").write_text("\n".join(lines))
+    for path in (folder / "depth").iterdir():
+        Image.fromarray((np.array(Image.open(path)) // 5).astype(np.uint16)).save(path)
+    camera = camera_file(tmp_path, views[0].K)
+    values = json.loads(camera.read_text())
+    camera.write_text(json.dumps(values | {"depth_scale": 1.0}))
+    same_views(imported(tmp_path, folder, "--camera", camera), views, atol=0.0011)
+    camera.write_text(json.dumps(values | {"depth_scale": 1000.0}))
+    refused("import", folder, "--camera", camera, names="camera.json", says="0.2 if 5000 are a metre")
+
+
 @pytest.mark.parametrize(("number", "fx"), [(1, 517.3), (2, 520.9), (3, 535.4)])
 def test_the_name_of_the_folder_says_which_camera(tmp_path, views, capsys, caplog, number, fx):
     view = views[0]
@@ -324,6 +500,10 @@ def spoil(name, text):
         (spoil("groundtruth.txt", b"1.0 0 0 0 0 0 0 one\n"), "is not a pose"),
         (spoil("groundtruth.txt", b"# none\n"), "none of its 3 depth images is usable: 3 no pose"),
         (spoil("rgb.txt", b"# none\n"), "3 no colour image at that time"),
+        (
+            spoil("rgb.txt", b"1305031000.0 rgb/x.png\n"),
+            "colour images share no time: the former begin 102.2 s",
+        ),
         (lambda folder: shutil.rmtree(folder / "depth"), "3 broken"),
     ],
 )

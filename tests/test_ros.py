@@ -180,7 +180,7 @@ def test_images_become_a_view(views):
     assert taken.name == "12.500"
     assert messages.view_of(depth, camera_info(view), None, view.pose).rgb is None
     with pytest.raises(InputError, match="camera info: is for 80 × 60 pixels, the depth image has 160 × 120"):
-        messages.view_of(depth, SimpleNamespace(height=60, width=80), None, view.pose)
+        messages.view_of(depth, replace(camera_info(view), height=60, width=80), None, view.pose)
     with pytest.raises(InputError, match="depth image: its encoding 'bgr8' is not supported"):
         messages.view_of(colour, camera_info(view), None, view.pose)
     zero = make("geometry_msgs/msg/Quaternion", w=0.0)

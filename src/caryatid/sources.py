@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +20,15 @@ from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
 from caryatid.graph import SupportGraph
-from caryatid.io.datasets import Dataset, Frame, find_sample, format_of, open_dataset
+from caryatid.io.datasets import (
+    Dataset,
+    Frame,
+    OpenOptions,
+    find_sample,
+    format_of,
+    join_datasets,
+    open_dataset,
+)
 from caryatid.io.graph_json import read_graph
 from caryatid.io.importing import choose_frames, levelled
 from caryatid.io.mask_sources import MaskSource, without_ignored
@@ -198,20 +206,22 @@ def open_recording(
     masks: MaskSource | None = None,
     ignore: Path | None = None,
     level: bool = False,
+    more: Sequence[str] = (),
 ) -> Dataset:
     """Open a dataset and decode every frame once, to report a broken frame before any other work.
 
-    A few sharp frames are chosen from a video. A mask source replaces the masks of the dataset. Pixels of a
-    mask to ignore are dropped, as by `without_ignored`. With `level`, the world frame is rotated so that the
-    table is level. The segmentation is `labels`, `auto`, or None to use labels if available.
+    It is joined with `more` of the same scene, whose poses are in the same world. A few sharp frames are
+    chosen from a video. A mask source replaces the masks of the dataset. Pixels of a mask to ignore are
+    dropped, as by `without_ignored`. With `level`, the world frame is rotated so that the table is level. The
+    segmentation is `labels`, `auto`, or None to use labels if available.
 
     Raises:
         InputError: The dataset or the mask is broken, required labels are missing, a segment is too small
             for a shape, or no table is visible to level the world frame.
     """
-    recording = open_dataset(folder, config.recording)
-    if recording.is_video:
-        recording = choose_frames(recording, config.recording)
+    use_masks = masks is None and segmentation != "auto"
+    opened = [open_dataset(f, config.recording, OpenOptions(masks=use_masks)) for f in (folder, *more)]
+    recording = join_datasets([choose_frames(d, config.recording) if d.is_video else d for d in opened])
     if ignore is not None:
         frames = [_ignoring(f, ignore, config.recording.max_pixels) for f in recording.frames]
         recording = replace(recording, frames=frames)
@@ -219,12 +229,12 @@ def open_recording(
         recording = levelled(recording, config)
     for note in recording.notes:
         log.info(note)
-    if segmentation == "labels" and masks is None and not recording.has_labels:
+    if segmentation == "labels" and use_masks and not recording.has_labels:
         raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
     points: Counter[int] = Counter()
     for frame in recording.frames:
         view = frame.load()
-        if view.labels is not None and masks is None:
+        if view.labels is not None and use_masks:
             pixels = np.bincount(view.labels[view.valid])
             points.update({label: int(pixels[label]) for label in np.flatnonzero(pixels).tolist()})
     if segmentation != "auto":
@@ -242,11 +252,13 @@ def extract(
     masks: MaskSource | None = None,
     ignore: Path | None = None,
     level: bool = False,
+    more: Sequence[str] = (),
 ) -> Iterator[Step]:
     """Open a recording or a cloud, and return the steps of all its views.
 
-    For a cloud with labels of object parts, object = label // `label_divisor`. The other arguments are as in
-    `open_source`, but the seed is that of every random choice.
+    A recording is joined with `more` of the same scene. For a cloud with labels of object parts, object =
+    label // `label_divisor`. The other arguments are as in `open_source`, but the seed is that of every
+    random choice.
 
     Raises:
         InputError: The source is unknown, broken, or lacks required labels; or masks are given for a cloud.
@@ -257,7 +269,10 @@ def extract(
         raise InputError(source, "a scene, which has no views yet", f"use `caryatid explore {source}`")
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
     if kind != "cloud":
-        return _look_at_all(explorer, open_recording(source, config, segmentation, masks, ignore, level))
+        opened = open_recording(source, config, segmentation, masks, ignore, level, more)
+        return _look_at_all(explorer, opened)
+    if more:
+        raise InputError(source, "a single cloud cannot be joined with others", "give recordings only")
     if masks is not None or ignore is not None:
         remedy = "omit --masks and --ignore; a cloud has its labels in the field label"
         raise InputError(source, "masks need images, and a cloud has none", remedy)

@@ -14,6 +14,7 @@ from caryatid.config.settings import read_settings
 from caryatid.errors import InputError, NoSurfaceError
 from caryatid.exploration import Explorer
 from caryatid.graph import SceneObject
+from caryatid.io.bags import is_rectified
 from caryatid.io.mask_sources import mask_source, without_ignored
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.planners import make_planner
@@ -117,7 +118,7 @@ class Exploration:
             CaryatidError: The view cannot be used. Without a table, it is kept until another one shows it.
         """
         T_world_camera = messages.matrix_of(transform.rotation, transform.translation, "camera")
-        rectified = self._settings.rectified or "rect" in self._settings.depth_topic.rpartition("/")[2]
+        rectified = self._settings.rectified or is_rectified(self._settings.depth_topic)
         view = messages.view_of(depth, info, others.get("colour"), T_world_camera, rectified=rectified)
         if self._settings.ignore:
             view = without_ignored(view, Path(self._settings.ignore), self._config.recording.max_pixels)

@@ -20,7 +20,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Change, Grasp, SceneObject, Support, SupportGraph
-from caryatid.io.bags import decode_colour, decode_depth
+from caryatid.io.bags import decode_colour, decode_depth, pinhole
 from caryatid.manipulation.order import Order
 from caryatid.planning.decision import Decision
 from caryatid.sensing.views import View
@@ -97,13 +97,18 @@ def view_of(depth: Any, info: Any, colour: Any, T_world_camera: Array, *, rectif
     """
     pixels = RecordingConfig().max_pixels
     metres = decode_depth(depth, "depth image", pixels)
-    if (info.height, info.width) != metres.shape:
-        height, width = metres.shape
-        reason = f"is for {info.width} × {info.height} pixels, the depth image has {width} × {height}"
+    K, size, part = pinhole(info)
+    if size != metres.shape[::-1]:
+        reason = f"{part}{', so' if part else ''} is for {size[0]} × {size[1]} pixels, the depth image has "
+        reason = f"{reason}{metres.shape[1]} × {metres.shape[0]}".strip()
         raise InputError("camera info", reason, "use the camera info of the aligned depth image")
+    if np.any(info.d) and not rectified:
+        reason = f"has distortion, d = {np.round(info.d, 4).tolist()}, and the images are not rectified"
+        remedy = "use rectified topics, such as image_rect of image_proc; if they are, set rectified"
+        raise InputError("camera info", reason, remedy)
     image = None if colour is None else decode_colour(colour, "colour image", pixels)
     name = f"{seconds_of(depth.header.stamp):.3f}"
-    return View(metres, _pinhole(info, rectified), T_world_camera, image, name=name)
+    return View(metres, K, T_world_camera, image, name=name)
 
 
 def with_masks(view: View, masks: Any, frames: Mapping[str, Array]) -> View:
@@ -141,23 +146,6 @@ def with_masks(view: View, masks: Any, frames: Mapping[str, Array]) -> View:
         inside = np.minimum(inside, share)
         names[label] = detection.results[0].hypothesis.class_id if detection.results else ""
     return replace(view, labels=labels, labels_are="segments", names=names)
-
-
-def _pinhole(info: Any, rectified: bool) -> Array:
-    """Camera matrix (3, 3) of whole, undistorted images."""
-    if max(info.binning_x, info.binning_y) > 1:
-        reason = f"has binning {info.binning_x} × {info.binning_y}"
-        raise InputError("camera info", reason, "publish images without binning")
-    part = [info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height]
-    if any(part) and part != [0, 0, info.width, info.height]:
-        reason = f"has a region of interest, {part[2]} × {part[3]} pixels at ({part[0]}, {part[1]})"
-        raise InputError("camera info", reason, "publish whole images")
-    if np.any(info.d) and not rectified:
-        reason = f"has distortion, d = {np.round(info.d, 4).tolist()}, and the images are not rectified"
-        remedy = "use rectified topics, such as image_rect of image_proc; if they are, set rectified"
-        raise InputError("camera info", reason, remedy)
-    P = np.reshape(info.p, (3, 4))[:, :3]
-    return P if P[0, 0] > 0.0 else np.reshape(info.k, (3, 3))
 
 
 def pose_message(make: Make, T: Array) -> Any:

@@ -28,7 +28,7 @@ SuiteName = Literal[
 """Names of the suites; the benchmark is imported later."""
 VIEWER_PORT = 8770
 """Default port of the viewer; if taken, the next free one."""
-Topic = Annotated[str | None, options.shown("TOPIC")]
+Topics = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, options.shown("TOPIC")]
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 ImagePath = Annotated[Path | None, options.shown("FILE")]
 
@@ -125,6 +125,8 @@ class Extract(RunCommand, options.LookingCommand, work="run:extract_views"):
 
     source: options.SourceName
     """Recording (folder in the BOP format) or cloud (.pcd, .ply)."""
+    more: Annotated[tuple[str, ...], tyro.conf.Positional, options.shown("[SOURCE ...]")] = ()
+    """More recordings of the same scene, with poses in the same world."""
     label_divisor: options.Count = 1
     """For clouds with labels of object parts: object = label // N."""
     level: options.Flag = False
@@ -171,11 +173,12 @@ class Import(options.Command, work="results:import_log"):
     """Bag, TUM RGB-D folder with depth.txt, or folder of a phone's recording."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Recording to write, a folder in the BOP format; must be new or empty."""
-    depth: Topic = None
-    """Depth images: 16UC1 or mono16 [mm], 32FC1 [m], or PNG-compressed. If omitted, list all topics."""
-    info: Topic = None
+    depth: Topics = ()
+    """Depth images: 16UC1 or mono16 [mm], 32FC1 [m], or PNG-compressed. If omitted, list all topics.
+    For several cameras, repeat --depth and --info."""
+    info: Topics = ()
     """CameraInfo of the depth images."""
-    rgb: Topic = None
+    rgb: Topics = ()
     """Colour images that depth is registered to; also used to pick sharp frames."""
     tf: Annotated[str | None, options.shown("FRAME")] = None
     """World frame with z up, such as map or base_link. If omitted, import one frame without a pose."""

@@ -36,9 +36,19 @@ from caryatid.viz.tables import census, describe, order_line, order_table
 def import_log(command: Import) -> None:
     output, source, out = command.output, command.source, command.out
     config = command.settings.read({"recording.max_views": command.views})
-    topics = OpenOptions(command.depth, command.info, command.rgb, command.tf, command.camera)
+    given = {"--depth": command.depth, "--info": command.info, "--rgb": command.rgb}
+    count = max(1, *map(len, given.values()))
+    for option, topics in given.items():
+        if len(topics) not in (0, count):
+            remedy = "give --depth and --info for each camera, and --rgb for all or none"
+            raise InputError(option, f"is given for {len(topics)} of {count} cameras", remedy)
+    depths, infos, rgbs = (topics or (None,) * count for topics in given.values())
+    cameras = [
+        OpenOptions(depth, info, rgb, command.tf, command.camera)
+        for depth, info, rgb in zip(depths, infos, rgbs, strict=True)
+    ]
     with output.working(f"reading {source.name}"):
-        imported = import_recording(source, out, topics, level=command.level, config=config)
+        imported = import_recording(source, out, cameras, level=command.level, config=config)
     read = len(imported) + sum(imported.skipped.values())
     views = [
         {"view": n, "frame": f.number, "time": f.time, "posed": f.T_world_camera is not None}

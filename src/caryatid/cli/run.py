@@ -62,13 +62,14 @@ def explore_scene(command: Explore) -> None:
 
 
 def extract_views(command: Extract) -> None:
-    config, name = command.settings.read(takes_views=True), Path(command.source).name
+    config = command.settings.read(takes_views=True)
+    name = " + ".join(Path(source).name for source in (command.source, *command.more))
     with RunWriter(command.out, config, _about(command)) as writer:
         with command.output.working("opening"):
             masks = command.mask_source(config)
             steps = extract(
                 command.source, config, masks=masks, ignore=command.ignore, level=command.level,
-                label_divisor=command.label_divisor, **command.looking,
+                label_divisor=command.label_divisor, more=command.more, **command.looking,
             )  # fmt: skip
         last = _record(command, writer, name, steps)
     _finish(command, writer, name, last)
@@ -269,6 +270,8 @@ def _about(command: Explore | Extract | Clear) -> dict[str, Any]:
     options |= {"preset": command.settings.preset, "masks": command.settings.masks}
     if not isinstance(command, Extract):
         options["planner"] = command.chosen_planner
+    if isinstance(command, Extract) and command.more:
+        options["more"] = list(command.more)
     if isinstance(command, Explore):
         options["early_stop"] = not command.no_early_stop
     name, seed = type(command).__name__.lower(), command.settings.seed

@@ -84,6 +84,8 @@ def evaluate_run(
             for view, true in zip(run.views, _truths(run, scene), strict=True)
         ]
     elif (folder / "scene_camera.json").is_file():
+        if run.record["options"].get("more"):
+            raise InputError(run.folder, "shows several recordings", "give the ground truth of a scene")
         known, recording = read_truth(folder / TRUTH_FILE), read_recording(folder)
         # A recording of one frame needs no names.
         lone = recording.frames[0] if len(recording) == 1 else None

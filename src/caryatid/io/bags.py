@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -16,6 +17,7 @@ from PIL import Image
 
 from caryatid.config import RecordingConfig
 from caryatid.errors import InputError, needs_extra
+from caryatid.geometry.transforms import Array
 from caryatid.io import images
 from caryatid.io.datasets import Dataset, OpenOptions
 from caryatid.io.images import BrokenImageError
@@ -36,6 +38,8 @@ COLOUR_ENCODINGS: Final = {
     "rgb8": "RGB", "bgr8": "BGR", "rgba8": "RGBX", "bgra8": "BGRX", "mono8": "L", "8UC1": "L",
 }  # fmt: skip
 """Encodings of colour → Pillow's raw mode."""
+_REALSENSE: Final = re.compile(r"/device_\d+/sensor_\d+(?=/)")
+"""Start of the topics of a sensor in bags of the RealSense SDK, which also store its options."""
 _CONFIG_HEADER: Final = struct.Struct("<iff")
 """Header of a compressed depth image: its format, and two parameters of inverse depth."""
 
@@ -58,31 +62,56 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     depth_topic = bag.require("--depth", options.depth, "images")
     info_topic = bag.require("--info", options.info, "cameras")
     rgb_topic = None if options.rgb is None else bag.require("--rgb", options.rgb, "images")
-    cameras, distorts = _read_cameras(bag, info_topic)
-    depths = bag.images(depth_topic, partial(decode_depth, max_pixels=config.max_pixels))
+    sensor, other = _REALSENSE.match(depth_topic), _REALSENSE.match(rgb_topic or "")
+    if sensor and other and sensor[0] != other[0]:
+        reason = f"depth of {sensor[0]} is not registered to the colour of another sensor, {other[0]}"
+        raise InputError(path, reason, "omit --rgb, or align depth to colour and record that")
+    cameras, notes = _read_cameras(bag, info_topic, depth_topic)
+    unit = bag.depth_unit(sensor[0]) if sensor else 0.001
+    if sensor and unit != 0.001:
+        notes.append(f"{sensor[0]} counts depth in units of {unit:g} m (Depth_Units)")
+    depths = bag.images(depth_topic, partial(decode_depth, max_pixels=config.max_pixels, unit=unit))
     colour = partial(decode_colour, max_pixels=config.max_pixels)
     colours = None if rgb_topic is None else bag.images(rgb_topic, colour)
-    pose_at, notes = None, []
+    tree = None
     if options.world is None:
-        notes.append("no --tf FRAME: poses are unknown, so only one frame is imported")
+        notes.insert(0, "no --tf FRAME: poses are unknown, so only one frame is imported")
     else:
-        tree = TransformTree(config.pose_gap)
-        for topic, received, message in bag.messages(bag.topics("transforms")):
-            for item in message.transforms:
-                t, q = item.transform.translation, item.transform.rotation
-                pose, time = (t.x, t.y, t.z, q.x, q.y, q.z, q.w), _stamp(item.header, received)
-                if is_pose(pose):
-                    parent, child = _frame(item.header.frame_id), _frame(item.child_frame_id)
-                    tree.add(parent, child, time, pose, fixed=topic.endswith("tf_static"))
-        if not tree.frames:
-            raise InputError(bag.path, "has no transforms", "record /tf and /tf_static, or omit --tf")
-        for frame in dict.fromkeys([options.world, *(depth.frame for depth in depths)]):
-            if frame not in tree.frames:
-                raise InputError(path, f"unknown frame '{frame}'", f"known frames: {', '.join(tree.frames)}")
-        pose_at = partial(tree.between, options.world)
-    if distorts:
-        notes.append("the lens has distortion, but a pinhole camera is assumed: use rectified topics")
-    return make_video(path, depths, colours, cameras, pose_at, config, notes)
+        tree = bag.transforms(config.pose_gap)
+        for frame in dict.fromkeys(depth.frame or cameras[0].frame for depth in depths):
+            notes += _check_way(tree, path, frame, options.world)
+    poses = None if tree is None or options.world is None else (tree, options.world)
+    return make_video(path, depths, colours, cameras, poses, config, notes)
+
+
+def _check_way(tree: TransformTree, path: Path, frame: str, world: str) -> list[str]:
+    """Check that transforms connect a camera's frame with the world, and list the parents that do not."""
+    if not tree.frames:
+        raise InputError(path, "has no transforms", "record /tf and /tf_static, or omit --tf")
+    if not frame:
+        reason = "neither depth images nor their camera info say their frame (frame_id is empty)"
+        raise InputError(path, reason, "set the frame_id of the driver and record again, or omit --tf")
+    for name in (world, frame):
+        if name not in tree.frames:
+            raise InputError(path, f"unknown frame '{name}'", f"known frames: {', '.join(tree.frames)}")
+    above, reached = tree.ancestors(frame), {*tree.ancestors(world)}
+    if reached.isdisjoint(above):
+        # A root is the one without parents.
+        top, root = (min(names, key=tree.parents) for names in (above, tree.ancestors(world)))
+        reason = f"no transform connects '{world}' with '{frame}': the roots are '{root}' and '{top}'"
+        remedy = f"record the transform from '{root}' to '{top}', or give --tf {top} (with --level if tilted)"
+        raise InputError(path, reason, remedy)
+    notes = []
+    for child in above:
+        lost = [parent for parent in tree.parents(child) if reached.isdisjoint(tree.ancestors(parent))]
+        used = [parent for parent in tree.parents(child) if parent not in lost]
+        if child in tree.moved:
+            words = f"frame '{child}' has several fixed poses in '{tree.moved[child]}'"
+            notes.append(f"{words}; the last is used")
+        if lost and used:
+            words = f"frame '{child}' has several parents: '{used[0]}' leads to '{world}' and is used"
+            notes.append(f"{words}, '{lost[0]}' does not")
+    return notes
 
 
 class _Bag:
@@ -139,6 +168,29 @@ class _Bag:
             found.append(TimedImage(name, time, frame, partial(self._image, topic, received, time, decode)))
         return found
 
+    def transforms(self, max_gap: float) -> TransformTree:
+        """All transforms, interpolated across gaps of at most `max_gap` [s]."""
+        tree = TransformTree(max_gap, str(self.path))
+        for topic, received, message in self.messages(self.topics("transforms")):
+            for item in message.transforms:
+                t, q = item.transform.translation, item.transform.rotation
+                pose, time = (t.x, t.y, t.z, q.x, q.y, q.z, q.w), _stamp(item.header, received)
+                if is_pose(pose):
+                    parent, child = (
+                        name.removeprefix("/") for name in (item.header.frame_id, item.child_frame_id)
+                    )
+                    tree.add(parent, child, time, pose, fixed=topic.endswith("tf_static"))
+        return tree
+
+    def depth_unit(self, sensor: str) -> float:
+        """Unit of depth [m] that the RealSense SDK recorded as an option of a sensor; 1 mm without it."""
+        unit = 0.001
+        for _, _, message in self.messages([f"{sensor}/option/Depth_Units/value"]):
+            unit = round(float(message.data), 9)  # a float of 32 bits
+        if not 0.0 < unit < 1.0:
+            raise InputError(self.path, f"Depth_Units of {sensor} is {unit:g} m", "record it again")
+        return unit
+
     def _image(
         self, topic: str, received: int, time: int, decode: Callable[[Any, str], NDArray[Any]]
     ) -> NDArray[Any]:
@@ -148,25 +200,56 @@ class _Bag:
         raise InputError(self.path, "changed while it was read", "import it again")
 
 
-def _read_cameras(bag: _Bag, topic: str) -> tuple[list[TimedCamera], bool]:
-    """The cameras of a topic, and whether a lens distorts."""
-    cameras, distorts, source = [], False, f"{bag.path}: {topic}"
+def _read_cameras(bag: _Bag, topic: str, depth_topic: str) -> tuple[list[TimedCamera], list[str]]:
+    """The cameras of a topic, and what to say about distortion."""
+    cameras, notes, source = [], [], f"{bag.path}: {topic}"
+    rectified = is_rectified(depth_topic)
+    is_raw = "raw" in depth_topic and not rectified
     for _, received, message in bag.messages([topic]):
-        # ROS 1 names the matrices in capitals.
-        K, D = (message.K, message.D) if hasattr(message, "K") else (message.k, message.d)
         time, frame = _stamp(message.header, received), _frame(message.header.frame_id)
-        size = int(message.width), int(message.height)
-        K = check_intrinsics(np.reshape(K, (3, 3)), source)
-        cameras.append(TimedCamera(source, time, frame, K, size))
-        distorts = distorts or bool(np.any(D))
+        K, size, part = pinhole(message, is_raw=is_raw)
+        cameras.append(TimedCamera(f"{source}{part}", time, frame, check_intrinsics(K, source), size))
+        if np.any(message.D if hasattr(message, "D") else message.d) and not rectified:
+            notes = ["the lens has distortion, but a pinhole camera is assumed: use rectified topics"]
     if not cameras:
         raise InputError(bag.path, f"'{topic}' has no messages", "record the camera info too")
-    return cameras, distorts
+    return cameras, notes
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether the name of a topic says that its images are free of distortion, such as image_rect."""
+    return re.search(r"(?<![a-z])rect", topic.lower()) is not None
+
+
+def pinhole(info: Any, *, is_raw: bool = False) -> tuple[Array, tuple[int, int], str]:
+    """Camera matrix (3, 3) and size (width, height) [px] of the images of a CameraInfo, of ROS 1 or 2.
+
+    P is the camera of rectified images, which every node that projects depth uses, and K that of raw ones
+    and of drivers that leave P empty. Both are of whole images: a region shifts them and binning divides
+    them, as in image_geometry. The last result says so in words, or is empty.
+    """
+    K, P = (info.K, info.P) if hasattr(info, "K") else (info.k, info.p)
+    K, P = np.reshape(K, (3, 3)), np.reshape(P, (3, 4))[:, :3]
+    if P[0, 0] > 0.0 and P[1, 1] > 0.0 and not (is_raw and K[0, 0] > 0.0):
+        K = P
+    part, region = "", info.roi
+    width, height = int(region.width or info.width), int(region.height or info.height)
+    if (region.x_offset, region.y_offset, width, height) != (0, 0, info.width, info.height):
+        K = K - np.array([[0.0, 0.0, region.x_offset], [0.0, 0.0, region.y_offset], [0.0, 0.0, 0.0]])
+        part = (
+            f" has a region of interest, {width} × {height} pixels at ({region.x_offset}, {region.y_offset})"
+        )
+    columns, rows = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
+    if max(columns, rows) > 1:
+        K = K / np.array([[columns], [rows], [1]])
+        part += f"{' and' if part else ' has'} binning {info.binning_x} × {info.binning_y}"
+    return K, (width // columns, height // rows), part
 
 
 def _frame(name: str) -> str:
-    """Name of a frame as ROS 2 writes it, without a slash."""
-    return name.removeprefix("/")
+    """Name of a frame as ROS 2 writes it, without a slash; the RealSense SDK writes 0 for none."""
+    name = name.removeprefix("/")
+    return "" if name == "0" else name
 
 
 def _stamp(header: Any, received: int) -> int:
@@ -174,29 +257,32 @@ def _stamp(header: Any, received: int) -> int:
     return int(header.stamp.sec * SECOND + header.stamp.nanosec) or received
 
 
-def decode_depth(message: Any, source: str, max_pixels: int) -> NDArray[np.float32]:
-    """Depth (H, W) [m] of an image message, compressed or not; 0 for NaN, infinite or negative values."""
+def decode_depth(message: Any, source: str, max_pixels: int, unit: float = 0.001) -> NDArray[np.float32]:
+    """Depth (H, W) [m] of an image message, compressed or not; 0 for NaN, infinite or negative values.
+
+    Whole numbers count a unit [m].
+    """
     if hasattr(message, "format"):
-        depth = _compressed_depth(message, source, max_pixels)
+        depth = _compressed_depth(message, source, max_pixels, unit)
     else:
         mode = _known(message, DEPTH_ENCODINGS, source)
         order = "B" if message.is_bigendian else ""
         raw = f"F;32{order}F" if mode == "F" else f"I;16{order}"
-        depth = _pixels(message, mode, raw, source) * (1.0 if mode == "F" else 0.001)
+        depth = _pixels(message, mode, raw, source) * (1.0 if mode == "F" else unit)
     return np.where(np.isfinite(depth) & (depth > 0.0), depth, 0.0).astype(np.float32)
 
 
-def _compressed_depth(message: Any, source: str, max_pixels: int) -> NDArray[np.floating[Any]]:
+def _compressed_depth(message: Any, source: str, max_pixels: int, unit: float) -> NDArray[np.floating[Any]]:
     encoding, _, codec = (part.strip() for part in message.format.partition(";"))
     data = message.data.tobytes()
     if "rvl" in codec.lower() or "jpeg" in message.format or "jpg" in message.format:
         reason = f"its depth is compressed as '{message.format}'"
         raise InputError(source, reason, "record it raw, or compressed as PNG")
     if "compressedDepth" not in codec:
-        return images.read_units(data, source, max_pixels) * 0.001
+        return images.read_units(data, source, max_pixels) * unit
     units = images.read_units(data[_CONFIG_HEADER.size :], source, max_pixels)
     if encoding != "32FC1":
-        return units * 0.001
+        return units * unit
     _, scale, offset = _CONFIG_HEADER.unpack_from(data)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(units > 0, scale / (units - np.float64(offset)), 0.0)

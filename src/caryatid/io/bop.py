@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -21,8 +22,11 @@ from caryatid.io.json_files import Numbers, json_text, parse_json, read_json, re
 from caryatid.io.staging import StagedFolder
 from caryatid.sensing.views import MAX_LABEL, View, check_intrinsics
 
-COLOUR_ENDINGS: Final = (".png", ".jpg", ".jpeg")
-"""Files of colour images; the first existing one counts."""
+log = logging.getLogger(__name__)
+
+DEPTH_ENDINGS: Final = (".png", ".tif", ".tiff")
+COLOUR_ENDINGS: Final = (*DEPTH_ENDINGS, ".jpg", ".jpeg")
+"""Files of depth and colour images; the first existing one counts."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,14 +42,22 @@ class _Mask:
     obj_id: Annotated[int, Ge(1), Le(MAX_LABEL)]
 
 
-Masks = tuple[tuple[Path, int], ...]
-"""Mask file and label (`obj_id`) of each object in a frame."""
+@dataclass(frozen=True, slots=True)
+class _Masks:
+    """The masks of a scene: file and `obj_id` (0 = unknown) of each mask of a frame.
+
+    Where an `obj_id` names a model and not one object, labels count the masks of a view.
+    """
+
+    frames: dict[int, list[tuple[Path, int]]]
+    labels_are: Literal["objects", "segments"] = "objects"
+    notes: tuple[str, ...] = ()
 
 
 def recognises(path: Path) -> bool:
-    """Whether a path is a scene folder."""
+    """Whether a path is a scene folder, or the depth folder of one of its sensors."""
     has_depth = (path / "depth").is_dir() and not (path / "depth.txt").exists()
-    return has_depth or (path / "scene_camera.json").is_file()
+    return has_depth or any(path.glob("scene_camera*.json")) or _is_depth(path)
 
 
 def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> Dataset:
@@ -54,42 +66,52 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     Raises:
         InputError: It is broken.
     """
-    return read_recording(path, config)
+    return read_recording(path, config, masks=options.masks)
 
 
-def read_recording(folder: str | Path, config: RecordingConfig | None = None) -> Dataset:
+def read_recording(
+    folder: str | Path, config: RecordingConfig | None = None, *, masks: bool = True
+) -> Dataset:
     """Read a BOP scene folder: `scene_camera.json`, `depth/`, and where they exist `rgb/` and `mask_visib/`.
 
-    `names.json` may name the objects by their `obj_id`: {"1": "mug"}.
+    `names.json` may name the objects by their `obj_id`: {"1": "mug"}. Masks are segments of their view if two
+    of a frame have one `obj_id`, or without `scene_gt.json`. Of masks that overlap, the smallest is on top.
     Cameras, poses and the table of masks are checked here, images when a view is loaded. A rotation matrix
     that is orthonormal to 0.02 is replaced by the nearest rotation.
 
     Args:
-        folder: The scene folder, or `sample-recording`. Lengths in it are millimetres.
+        folder: The scene folder, or `sample-recording`. Lengths in it are millimetres. If each sensor has
+            files of its own, the folder of depth images of one, such as `000001/depth_cam1`.
         config: Maximum size of images.
+        masks: Whether to read the masks.
 
     Raises:
         InputError: A table is missing or broken, a camera or pose is not valid, a mask names no object,
-            several frames have no poses, or there is no frame. Loading a frame raises it if an image is
-            missing, broken, or of another size or mode, or if masks overlap.
+            several frames have no poses, or there is no frame or a choice of sensors. Loading a frame raises
+            it if an image is missing, broken, or of another size or mode.
     """
     check_type("folder", folder, (str, Path), "give a scene folder in the BOP format")
     folder = find_sample(folder)
     if not folder.is_dir():
         raise InputError(folder, "no such folder", "give a scene folder in the BOP format")
-    path = folder / "scene_camera.json"
+    folder, end = _find_sensor(folder)
+    path = folder / f"scene_camera{end}.json"
     remedy = "a recording needs it: cam_K and depth_scale of each frame"
     cameras = parse_json(dict[int, _Camera], read_json(path, remedy), path, remedy)
     if not cameras:
-        raise InputError(folder, "has no frames: scene_camera.json is empty", "give a recording with frames")
-    for image in sorted((folder / "depth").glob("*.png")):
-        if image.stem not in {f"{number:06d}" for number in cameras}:
+        raise InputError(folder, f"has no frames: {path.name} is empty", "give a recording with frames")
+    stems = {f"{number:06d}" for number in cameras}
+    for image in sorted((folder / f"depth{end}").glob("*.*")):
+        if image.suffix in DEPTH_ENDINGS and image.stem not in stems:
             remedy = "add its camera there, or delete the image"
-            raise InputError(image, "has no entry in scene_camera.json", remedy)
-    masks, most = _read_masks(folder, set(cameras)), (config or RecordingConfig()).max_pixels
-    names = read_names(folder)
+            raise InputError(image, f"has no entry in {path.name}", remedy)
+    known, most = _Masks({}), (config or RecordingConfig()).max_pixels
+    if masks and (folder / f"mask_visib{end}").is_dir():
+        known = _read_masks(folder / f"mask_visib{end}", folder / f"scene_gt{end}.json", set(cameras))
+    names = read_names(folder) if masks else None
+    overlaps: list[int] = []
     frames = tuple(
-        _frame(folder, n, cameras[n], masks.get(n), names, f"{path}: frame {n}", most)
+        _frame(folder, end, n, cameras[n], known, names, overlaps, f"{path}: frame {n}", most)
         for n in sorted(cameras)
     )
     without = [f.number for f in frames if f.T_world_camera is None]
@@ -97,7 +119,7 @@ def read_recording(folder: str | Path, config: RecordingConfig | None = None) ->
         reason = f"{len(without)} of {len(frames)} frames have no pose (cam_R_w2c, cam_t_w2c)"
         reason += f"; the first is frame {without[0]}"
         raise InputError(path, reason, "add poses, or give a single frame")
-    return Dataset(folder, frames)
+    return Dataset(folder, frames, notes=known.notes)
 
 
 def write_recording(folder: str | Path, views: Iterable[View]) -> None:
@@ -108,7 +130,8 @@ def write_recording(folder: str | Path, views: Iterable[View]) -> None:
 
     Args:
         folder: The folder; must not exist, or be empty.
-        views: In frame order. Labels become one mask each and `obj_id` = label.
+        views: In frame order. Labels become one mask each and `obj_id` = label. Those of segments have no
+            scene_gt.json, because they name no objects.
 
     Raises:
         InputError: No views, or the folder cannot be written.
@@ -125,6 +148,7 @@ def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
     """
     cameras: dict[str, Any] = {}
     objects: dict[str, Any] = {}
+    are_segments = False
     for index, view in enumerate(views):
         depth_scale = 0.1
         while view.depth.max() > depth_scale * np.iinfo(np.uint16).max / 1000.0:
@@ -140,6 +164,7 @@ def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
         if view.rgb is not None:
             folder.write(f"rgb/{index:06d}.png", images.png(view.rgb))
         if view.labels is not None:
+            are_segments |= view.labels_are == "segments"
             present = [int(k) for k in np.unique(view.labels) if k > 0]
             objects[str(index)] = [{"obj_id": k} for k in present]
             for order, label in enumerate(present):
@@ -148,27 +173,51 @@ def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
     if not cameras:
         raise InputError(folder.folder, "no views to write", "give at least one")
     folder.write("scene_camera.json", json_text(cameras).encode())
-    if objects:
+    if objects and not are_segments:
         folder.write("scene_gt.json", json_text(objects).encode())
     folder.publish()
 
 
+def _is_depth(path: Path) -> bool:
+    """Whether a path is the folder of depth images of a sensor."""
+    return path.name.startswith("depth") and (path.parent / f"scene_camera{path.name[5:]}.json").is_file()
+
+
+def _find_sensor(path: Path) -> tuple[Path, str]:
+    """The scene folder, and the end of the names of its files: `_cam1` if sensors have files of their own."""
+    if _is_depth(path):
+        return path.parent, path.name[5:]
+    ends = sorted(file.stem.removeprefix("scene_camera") for file in path.glob("scene_camera*.json"))
+    if not ends or "" in ends:
+        return path, ""
+    usable = [end for end in ends if (path / f"depth{end}").is_dir()]
+    if len(usable) != 1:
+        reason = f"{len(usable)} of its sensors have depth: {', '.join(e[1:] for e in usable or ends)}"
+        folder = f"such as {path / f'depth{usable[0]}'}" if usable else f"named depth{ends[0]}"
+        raise InputError(path, reason, f"give the folder of depth images of one, {folder}")
+    return path, usable[0]
+
+
 def _frame(
     folder: Path,
+    end: str,
     number: int,
     camera: _Camera,
-    masks: Masks | None,
+    known: _Masks,
     names: dict[int, str] | None,
+    overlaps: list[int],
     source: str,
     max_pixels: int,
 ) -> Frame:
     K = check_intrinsics(camera.cam_K.reshape(3, 3), f"{source}: cam_K")
     T_world_camera = _pose(camera, source)
-    depth_path, rgb_path = folder / f"depth/{number:06d}.png", None
-    if (folder / "rgb").is_dir():
-        paths = [folder / f"rgb/{number:06d}{ending}" for ending in COLOUR_ENDINGS]
-        rgb_path = next((path for path in paths if path.exists()), paths[0])
-    name = f"{folder.resolve().name}/{number:06d}"
+    depth_path, rgb_path = _image(folder / f"depth{end}", number, DEPTH_ENDINGS), None
+    if (folder / f"rgb{end}").is_dir():
+        rgb_path = _image(folder / f"rgb{end}", number, COLOUR_ENDINGS)
+    name, masks = f"{folder.resolve().name}/{number:06d}", known.frames.get(number)
+    if masks is not None and known.labels_are == "segments":
+        names = names and {label: names[k] for label, (_, k) in enumerate(masks, 1) if k in names}
+        masks = [(path, label) for label, (path, _) in enumerate(masks, 1)]
 
     def load() -> View:
         depth = images.read_depth(depth_path, camera.depth_scale, max_pixels)
@@ -176,27 +225,45 @@ def _frame(
             reason = "the frame is empty: no pixel has a depth reading"
             raise InputError(depth_path, reason, "remove this frame")
         rgb = None if rgb_path is None else images.decode_image(rgb_path, max_pixels=max_pixels)
-        labels = None if masks is None else _read_labels(masks, depth, max_pixels)
-        return View(depth, K, T_world_camera, rgb, labels, name=name, names=names)
+        labels = None
+        if masks is not None:
+            labels, shared = _read_labels(masks, depth, max_pixels)
+            if shared and not overlaps:  # frames are loaded several times, and one line is enough
+                overlaps.append(number)
+                said = "%s: masks overlap, in frame %d in %d pixels; each goes to the smallest mask"
+                log.info(said, folder / f"mask_visib{end}", number, shared)
+        return View(
+            depth, K, T_world_camera, rgb, labels, name=name, labels_are=known.labels_are, names=names
+        )
 
     return Frame(name, number, load, T_world_camera, has_labels=masks is not None)
 
 
-def _read_labels(masks: Masks, depth: NDArray[np.float32], max_pixels: int) -> NDArray[np.int32]:
-    """Object number of each pixel (H, W), 0 = nothing."""
-    labels = np.zeros(depth.shape, dtype=np.int32)
+def _image(folder: Path, number: int, endings: tuple[str, ...]) -> Path:
+    """The image of a frame, by the first ending that exists."""
+    paths = [folder / f"{number:06d}{ending}" for ending in endings]
+    return next((path for path in paths if path.exists()), paths[0])
+
+
+def _read_labels(
+    masks: list[tuple[Path, int]], depth: NDArray[np.float32], max_pixels: int
+) -> tuple[NDArray[np.int32], int]:
+    """Label of each pixel (H, W), 0 = nothing, and the number of pixels in several masks.
+
+    The smallest mask is on top, as in `labels_from_masks`: a mug in front of a box stays whole.
+    """
+    read = []
     for path, label in masks:
         mask = images.read_mask(path, max_pixels=max_pixels)
         if mask.shape != depth.shape:
             (height, width), (rows, columns) = mask.shape, depth.shape
             reason = f"has {width}×{height} pixels, but the depth image has {columns}×{rows}"
             raise InputError(path, reason, "register the images to one size")
-        taken = labels[mask & (labels > 0)]
-        if len(taken):
-            reason = f"overlaps the mask of obj_id {taken[0]} in {len(taken)} pixels"
-            raise InputError(path, reason, "give each pixel to one object")
+        read.append((int(mask.sum()), mask, label))
+    labels = np.zeros(depth.shape, dtype=np.int32)
+    for _, mask, label in sorted(read, key=lambda sized: -sized[0]):
         labels[mask] = label
-    return labels
+    return labels, int((sum(mask.astype(np.intp) for _, mask, _ in read) > np.intp(1)).sum())
 
 
 def _pose(camera: _Camera, name: str) -> Array | None:
@@ -214,23 +281,36 @@ def _pose(camera: _Camera, name: str) -> Array | None:
     return transforms.invert(transforms.as_rigid(T_camera_world, f"{name}: cam_R_w2c"))
 
 
-def _read_masks(folder: Path, known: set[int]) -> dict[int, Masks]:
-    mask_folder, path = folder / "mask_visib", folder / "scene_gt.json"
-    if not mask_folder.is_dir():
-        return {}
+def _read_masks(folder: Path, path: Path, frames: set[int]) -> _Masks:
+    """The masks in a folder, with the `obj_id` that a table gives them; lost ones are left out."""
+    files, repeats, notes = sorted(folder.glob("*.png")), "", []
+    table: dict[int, list[tuple[Path, int]]] = {}
+    if not path.exists():
+        for file in files:
+            if not (file.stem[:6].isdecimal() and int(file.stem[:6]) in frames):
+                raise InputError(file, "is of no frame in scene_camera.json", "name it FRAME_MASK.png")
+            table.setdefault(int(file.stem[:6]), []).append((file, 0))
+        note = f"no {path.name}: masks are segments of their view"
+        return _Masks(table, "segments", (note,) if files else ())
     remedy = f'masks need it: one {{"obj_id": …}} for each, from 1 to {MAX_LABEL}'
-    table: dict[int, Masks] = {}
     for frame, masks in parse_json(dict[int, list[_Mask]], read_json(path, remedy), path, remedy).items():
-        source = f"{path}: frame {frame}"
-        if frame not in known:
+        if frame not in frames:
+            source = f"{path}: frame {frame}"
             raise InputError(source, "is not in scene_camera.json", "add its camera there")
-        labels = [mask.obj_id for mask in masks]
-        for twice in {label for label in labels if labels.count(label) > 1}:
-            reason = f"two masks have obj_id {twice}"
-            raise InputError(source, reason, "give each object of the scene its own number")
-        names = (f"{frame:06d}_{index:06d}.png" for index in range(len(labels)))
-        table[frame] = tuple((mask_folder / name, label) for name, label in zip(names, labels, strict=True))
-    expected = {image for masks_of_frame in table.values() for image, _ in masks_of_frame}
-    for image in sorted(set(mask_folder.glob("*.png")) - expected):
-        raise InputError(image, "names no object: scene_gt.json has no entry for it", "add its obj_id there")
-    return table
+        ids = [mask.obj_id for mask in masks]
+        table[frame] = [(folder / f"{frame:06d}_{index:06d}.png", k) for index, k in enumerate(ids)]
+        if len(set(ids)) < len(ids) and not repeats:
+            twice = next(k for k in ids if ids.count(k) > 1)
+            repeats = f"two masks of frame {frame} have obj_id {twice}"
+            notes.append(f"{path.name}: {repeats}, so masks are segments of their view")
+    expected = {file for masks in table.values() for file, _ in masks}
+    for image in files:
+        if image not in expected:
+            reason = f"names no object: {path.name} has no entry for it"
+            raise InputError(image, reason, "add its obj_id there")
+    if lost := expected.difference(files):
+        notes.append(f"{len(lost)} of {len(expected)} masks are left out: {min(lost)} is missing")
+        table = {frame: [m for m in masks if m[0] not in lost] for frame, masks in table.items()}
+    if not files:
+        return _Masks({}, notes=tuple(notes))
+    return _Masks(table, "segments" if repeats else "objects", tuple(notes))

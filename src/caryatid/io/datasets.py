@@ -7,10 +7,12 @@ An input format is a module or object with two functions, `recognises(path)` and
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from importlib.metadata import entry_points
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -125,6 +127,31 @@ class Dataset(Sequence[View]):
         raise InputError(self.path, f"has no frame '{name}'", "give the recording of this run")
 
 
+def join_datasets(datasets: Sequence[Dataset]) -> Dataset:
+    """Join datasets of one scene, whose poses share a world; their frames are ordered by time and renumbered.
+
+    Raises:
+        InputError: One of several has no poses.
+    """
+    first, *others = datasets
+    if not others:
+        return first
+    for dataset in datasets:
+        if not dataset.has_poses:
+            remedy = "give poses in one world to all, such as --tf FRAME of import"
+            raise InputError(dataset.path, "has no camera poses, so it cannot be joined with others", remedy)
+    frames = sorted((frame for dataset in datasets for frame in dataset.frames), key=attrgetter("time"))
+    title = "+".join(dict.fromkeys(dataset.path.resolve().name for dataset in datasets))
+
+    def renumbered(number: int, frame: Frame) -> Frame:
+        name = f"{title}/{number:06d}"
+        return replace(frame, name=name, number=number, load=lambda: replace(frame.load(), name=name))
+
+    skipped = sum((Counter(dataset.skipped) for dataset in datasets), Counter[str]())
+    notes = tuple(dict.fromkeys(note for dataset in datasets for note in dataset.notes))
+    return Dataset(first.path, [renumbered(*each) for each in enumerate(frames)], skipped, notes)
+
+
 @dataclass(frozen=True, slots=True)
 class OpenOptions:
     """Options of formats.
@@ -135,6 +162,7 @@ class OpenOptions:
         rgb: Topic of colour images, or None.
         world: Frame of a bag that is the world, level with z up; None takes no poses.
         camera_file: Camera of a TUM RGB-D folder, or None for the published ones.
+        masks: Whether the masks of a recording are read.
     """
 
     depth: str | None = None
@@ -142,6 +170,7 @@ class OpenOptions:
     rgb: str | None = None
     world: str | None = None
     camera_file: Path | None = None
+    masks: bool = True
 
 
 def format_of(path: Path) -> Any:

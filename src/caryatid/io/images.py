@@ -25,7 +25,16 @@ MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
 """Pillow modes of depth images, and of masks."""
 MAX_PIXELS: Final = RecordingConfig().max_pixels
 """Default of the maximum number of pixels."""
-_BAD_BYTES: Final = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, zlib.error)
+_BAD_BYTES: Final = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    EOFError,
+    IndexError,
+    struct.error,
+    zlib.error,
+)
 """Exceptions of Pillow for a broken image."""
 
 
@@ -34,12 +43,16 @@ class BrokenImageError(InputError):
 
 
 def read_depth(path: Path, depth_scale: float, max_pixels: int = MAX_PIXELS) -> NDArray[np.float32]:
-    """Read the depth (H, W) [m], 0 = no reading, of a 16-bit PNG in units of `depth_scale` [mm].
+    """Read the depth (H, W) [m], 0 = no reading, of a PNG or TIFF in units of `depth_scale` [mm].
 
     Raises:
-        InputError: Missing, truncated, too large, or not 16 bit.
+        InputError: Missing, truncated, too large, or neither 16 bit nor floating point.
     """
-    return (read_units(path, max_pixels=max_pixels) * (depth_scale / 1000.0)).astype(np.float32)
+    units = decode_image(
+        path, modes=(*DEPTH_MODES, "F"), what="a 16-bit grey PNG or TIFF", max_pixels=max_pixels
+    )
+    depth = (units.astype(np.float64) * (depth_scale / 1000.0)).astype(np.float32)
+    return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(0.0))
 
 
 def read_units(image: Path | bytes, name: str = "", max_pixels: int = MAX_PIXELS) -> NDArray[np.int32]:
@@ -58,7 +71,7 @@ def decode_image(
     what: str = "",
     max_pixels: int = MAX_PIXELS,
 ) -> NDArray[Any]:
-    """Decode a PNG or JPEG, a file or its content: (H, W), or (H, W, 3) if colour is allowed.
+    """Decode a PNG or JPEG, a file or its content, or a TIFF file: (H, W), or (H, W, 3) if colour is allowed.
 
     Grey images then have three equal channels. Pillow's `modes` restrict it to `what` the error says.
 
@@ -68,12 +81,13 @@ def decode_image(
     source, remedy = image if isinstance(image, Path) else name, "copy or record the file again"
     try:
         content = image.read_bytes() if isinstance(image, Path) else image
+        formats = ("PNG", "JPEG", "TIFF") if isinstance(image, Path) else ("PNG", "JPEG")
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with _open(content) as whole:
+            with Image.open(io.BytesIO(content), formats=formats) as whole:
                 if whole.format == "PNG":
                     whole.verify()  # decoding ignores a wrong checksum or a missing end
-            with _open(content) as opened:
+            with Image.open(io.BytesIO(content), formats=formats) as opened:
                 width, height = opened.size
                 if modes is not None and opened.mode not in modes:
                     reason = f"has pixels of mode {opened.mode}, not {what}"
@@ -123,10 +137,6 @@ def npy(array: NDArray[Any]) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
     return buffer.getvalue()
-
-
-def _open(content: bytes) -> Image.Image:
-    return Image.open(io.BytesIO(content), formats=("PNG", "JPEG"))
 
 
 def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:

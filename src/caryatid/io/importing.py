@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from caryatid.errors import InputError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io.bop import write_views
-from caryatid.io.datasets import NO_COLOUR, NO_POSE, Dataset, Frame, OpenOptions, open_dataset
+from caryatid.io.datasets import NO_COLOUR, NO_POSE, Dataset, Frame, OpenOptions, join_datasets, open_dataset
 from caryatid.io.images import BrokenImageError
 from caryatid.io.staging import StagedFolder
 from caryatid.io.video import SECOND
@@ -41,7 +41,7 @@ _REMEDIES: Final[Mapping[str, str]] = {
 def import_recording(
     source: str | Path,
     out: str | Path,
-    options: OpenOptions | None = None,
+    options: OpenOptions | Sequence[OpenOptions] | None = None,
     *,
     level: bool = False,
     config: Config | None = None,
@@ -51,7 +51,7 @@ def import_recording(
     Args:
         source: A bag, a TUM RGB-D folder, or another dataset that `open_dataset` recognises.
         out: Folder to write; must not exist, or be empty. It appears whole or not at all.
-        options: Topics of a bag, and the camera of a TUM RGB-D folder.
+        options: Topics of a bag, for each of its cameras, and the camera of a TUM RGB-D folder.
         level: Turn the world so that the table is level, for poses whose z axis does not point up.
         config: Which frames are sharp and different, the maximum number of views, and how to find a table.
 
@@ -63,9 +63,12 @@ def import_recording(
             is found to level the world, or `out` cannot be written.
     """
     config = config or Config()
-    dataset = open_dataset(source, config.recording, options)
+    cameras = options if isinstance(options, Sequence) else [options]
+    datasets = [open_dataset(source, config.recording, camera) for camera in cameras]
     with StagedFolder(out) as folder:
-        chosen = choose_frames(dataset, config.recording)
+        chosen = join_datasets([choose_frames(dataset, config.recording) for dataset in datasets])
+        if len(cameras) > 1:  # of all together, no more than `max_views`
+            chosen = choose_frames(chosen, config.recording)
         if level:
             chosen = levelled(chosen, config)
         write_views(folder, chosen)

@@ -7,7 +7,7 @@ z up.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -59,7 +59,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     reader = _reader(path)
     if reader is None:
         raise InputError(path, "is an archive", "unzip it, and give the folder with metadata and rgbd")
-    if options != OpenOptions():
+    if replace(options, masks=True) != OpenOptions():
         remedy = f"{path} is the recording of a phone; omit them"
         reason = "apply only to bags and TUM folders"
         raise InputError("--depth, --info, --rgb, --tf, --camera", reason, remedy)

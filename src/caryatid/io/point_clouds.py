@@ -7,7 +7,7 @@ import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,10 @@ from caryatid.sensing.views import MAX_LABEL, Cloud
 
 Columns = dict[str, NDArray[Any]]
 """Fields of one value per point (N,)."""
+
+
+_PCD_DEFAULTS: Final = {"SIZE": "4", "TYPE": "F", "COUNT": "1"}
+"""Lines that PCD files older than 0.7 may lack, and what they say for each field."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -120,12 +124,7 @@ def _parse_pcd(content: bytes) -> tuple[Columns, Array]:
     if end is None:
         raise ValueError("no DATA line")
     lines = content[: end.end()].decode("ascii", errors="replace").splitlines()
-    if not any(line.startswith("COUNT") for line in lines):
-        names = next((line.split()[1:] for line in lines if line.startswith("FIELDS")), [])
-        lines.insert(0, "COUNT" + " 1" * len(names))
-    header = MetaData.parse_header(lines)
-    if not len(header.fields) == len(header.size) == len(header.type) == len(header.count):
-        raise ValueError("FIELDS, SIZE, TYPE and COUNT do not agree")
+    header = MetaData.parse_header(_tidy_header(lines))
     if sum(header.count) > 1000:  # the library makes a field of each
         raise ValueError(f"the sum of COUNT, {sum(header.count)}, exceeds 1000")
     dtype = header.build_dtype()
@@ -141,21 +140,56 @@ def _parse_pcd(content: bytes) -> tuple[Columns, Array]:
         if len(body) - needed >= dtype.itemsize and any(body[needed:]):
             raise ValueError(f"POINTS {header.points}, but more data follows")
     else:
-        promised = struct.unpack("<II", body[:8])[1]
+        packed, promised = struct.unpack("<II", body[:8])
     # LZF writes at most 264 bytes for 3.
     if promised != needed or needed > 100 * len(body.strip()):
         raise ValueError(f"POINTS {header.points} take {needed} bytes, {len(body)} bytes follow")
-    file = io.BytesIO(header.compose_header().encode() + body)
+    encoding = header.data
+    if encoding.value == "binary_compressed" and packed == promised:  # what did not shrink is stored as it is
+        raw, encoding = np.empty(header.points, dtype), type(encoding)("binary")
+        starts = 8 + header.points * np.cumsum([0, *(dtype[name].itemsize for name in dtype.names or ())])
+        for name, start in zip(dtype.names or (), starts, strict=False):
+            raw[name] = np.frombuffer(body, dtype[name], header.points, start)
+        body = raw.tobytes()
+    file = io.BytesIO(header.compose_header(encoding).encode() + body)
     data = np.atleast_1d(PointCloud.from_fileobj(file).pc_data)
     if len(data) != header.points:
         raise ValueError(f"POINTS {header.points}, but data of {len(data)} points follows")
     return {name: data[name] for name in dtype.names or ()}, np.array(header.viewpoint[:3], dtype=np.float64)
 
 
+def _tidy_header(lines: list[str]) -> list[str]:
+    """A header as pypcd4 takes it, of one that PCL takes: padding without names, older versions, defaults."""
+    rows = (line.partition("#")[0].split() for line in lines)
+    words = {row[0].upper(): row[1:] for row in rows if row}
+    names = words.get("FIELDS") or words.pop("COLUMNS", [])
+    table = [names, *(words.get(key, [default] * len(names)) for key, default in _PCD_DEFAULTS.items())]
+    if len({len(column) for column in table}) > 1:
+        raise ValueError("FIELDS, SIZE, TYPE and COUNT do not agree")
+    fields = [field for field in zip(*table, strict=True) if field[3] != "0"]
+    for column, key in enumerate(("FIELDS", *_PCD_DEFAULTS)):
+        words[key] = [field[column] for field in fields]
+    words["FIELDS"] = [f"padding{n}" if name == "_" else name for n, name in enumerate(words["FIELDS"])]
+    if words.get("VERSION") in (["0.5"], [".5"], ["0.6"], [".6"]):
+        del words["VERSION"]
+    words.setdefault("WIDTH", words.get("POINTS", []))
+    return [" ".join((key, *rest)) for key, rest in words.items()]
+
+
 def _parse_ply(content: bytes) -> tuple[Columns, Array]:
     """The fields, and the origin as the viewpoint; like `_parse_pcd`."""
-    from trimesh.exchange.ply import load_ply
+    from trimesh.exchange.ply import _parse_header, load_ply
 
+    file = io.BytesIO(content)
+    elements, is_ascii, _ = _parse_header(file)
+    kinds = list(elements["vertex"]["properties"].values())
+    if not is_ascii and next(iter(elements)) == "vertex" and "LIST" not in "".join(kinds):
+        # Without what follows the points, because trimesh takes only lists of one length, as of triangles.
+        start = file.tell()
+        head = re.sub(rb"(?ms)^element (?!vertex).*?(?=^end_header)", b"", content[:start])
+        if len(head) < start:
+            size = elements["vertex"]["length"] * np.dtype(",".join(kinds)).itemsize
+            content = head + content[start : start + size]
     loaded = load_ply(io.BytesIO(content), fix_texture=False, skip_materials=True)
     vertex = loaded["metadata"]["_ply_raw"]["vertex"]
     data = vertex["data"]

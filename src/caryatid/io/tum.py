@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
@@ -55,7 +56,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     Raises:
         InputError: A list is missing or broken, or the camera is unknown.
     """
-    if options != OpenOptions(camera_file=options.camera_file):
+    if replace(options, camera_file=None, masks=True) != OpenOptions():
         remedy = f"{path} is a TUM RGB-D folder; omit them"
         raise InputError("--depth, --info, --rgb, --tf", "apply only to bags", remedy)
     file, size, note = _read_camera(path, options.camera_file)
@@ -65,27 +66,30 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     depths = _read_list(path / "depth.txt", partial(images.read_depth, depth_scale=file.depth_scale, **limit))
     decode = partial(images.decode_image, **limit)
     colours = _read_list(path / "rgb.txt", decode) if (path / "rgb.txt").is_file() else None
-    pose_at, notes = None, [note]
+    tree, notes = TransformTree(config.pose_gap), [note]
     poses = path / "groundtruth.txt"
     if poses.is_file():
-        tree = TransformTree(config.pose_gap)
         for time, words in _read_rows(poses, 8):
             with suppress(ValueError):
                 if is_pose(pose := [float(word) for word in words]):
                     tree.add(_WORLD, _CAMERA, time, pose)
                     continue
             raise _broken(poses, f"'{' '.join(words)}' is not a pose")
-        pose_at = partial(tree.between, _WORLD)
     else:
         notes.append("no groundtruth.txt: poses are unknown, so only one frame is imported")
-    return make_video(path, depths, colours, [camera], pose_at, config, notes)
+    return make_video(
+        path, depths, colours, [camera], (tree, _WORLD) if poses.is_file() else None, config, notes
+    )
 
 
 def _read_camera(folder: Path, camera_file: Path | None) -> tuple[_CameraFile, tuple[int, int] | None, str]:
     """The camera from a file or as published, its image size [px] if known, and a note."""
     if camera_file is not None:
-        document = read_json(camera_file, "give fx, fy, cx, cy [px] and depth_scale [mm]")
-        return parse_json(_CameraFile, document, camera_file), None, f"camera: {camera_file}"
+        remedy = (
+            "give fx, fy, cx, cy [px], and depth_scale, the millimetres of a unit: 0.2 if 5000 are a metre"
+        )
+        document = read_json(camera_file, remedy)
+        return parse_json(_CameraFile, document, camera_file, remedy), None, f"camera: {camera_file}"
     for name, (fx, fy, cx, cy) in PUBLISHED.items():
         if name in folder.resolve().name.lower():
             note = f"published camera of {name}: fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} px"
@@ -100,13 +104,17 @@ def _read_list(path: Path, read: Callable[[Path], NDArray[Any]]) -> list[TimedIm
 
 
 def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
-    """Rows of a list: a time, in ns here, and the other columns."""
+    """Rows of a list: a time, in ns here, and the other columns; further ones are left out.
+
+    Commas separate columns as spaces do, and a first line of names is skipped.
+    """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise _broken(path, f"cannot be read ({error})") from None
     timed = []
-    for words in filter(None, (line.partition("#")[0].split() for line in lines)):
+    rows = [words for line in lines if (words := line.partition("#")[0].replace(",", " ").split())]
+    for words in rows[1:] if rows and re.search("time|stamp", rows[0][0].lower()) else rows:
         try:
             time = Decimal(words[0])
             valid = abs(time) < _LATEST
@@ -114,9 +122,9 @@ def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
             valid = False
         if not valid:
             raise _broken(path, "a row does not start with a time in seconds")
-        if len(words) != columns:
+        if len(words) < columns:
             raise _broken(path, f"'{' '.join(words)}' has {len(words)} columns, not {columns}")
-        timed.append((int(time * SECOND), words[1:]))
+        timed.append((int(time * SECOND), words[1:columns]))
     return timed
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_left
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import islice
 from math import hypot
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,8 @@ class TimedCamera:
     size: tuple[int, int] | None
 
 
+MAX_WAYS: Final = 1000
+"""Most frames on all ways from a frame upwards that are visited."""
 Timed = TypeVar("Timed", TimedImage, TimedCamera)
 
 
@@ -60,14 +63,18 @@ def make_video(
     depths: Sequence[TimedImage],
     colours: Sequence[TimedImage] | None,
     cameras: Sequence[TimedCamera],
-    pose_at: Callable[[str, int], Array | None] | None,
+    poses: tuple[TransformTree, str] | None,
     config: RecordingConfig,
     notes: Sequence[str],
 ) -> Dataset:
     """Find the colour, camera and pose of each depth image; they are numbered in their order here.
 
-    `pose_at` gives the pose (4, 4) of a frame at a time [ns], or None if it is unknown. Without it, views
-    have no poses, and without `colours` no colour. Complete frames are ordered by time, others are counted.
+    `poses` are transforms and the frame that is the world. Without them, views have no poses, and without
+    `colours` no colour. Complete frames are ordered by time, others are counted.
+
+    Raises:
+        InputError: Two ways through the transforms contradict each other, or the depth images share no time
+            with colours or transforms.
     """
     frames, skipped = [], Counter[str]()
     by_time = attrgetter("time")
@@ -80,16 +87,34 @@ def make_video(
             if colour is None or abs(colour.time - depth.time) > config.colour_gap * SECOND:
                 skipped[NO_COLOUR] += 1
                 continue
-        if pose_at is not None:
-            T_world_camera = pose_at(depth.frame, depth.time)
+        camera = _nearest(cameras, depth.time) or cameras[0]
+        if poses is not None:
+            T_world_camera = poses[0].between(poses[1], depth.frame or camera.frame, depth.time)
             if T_world_camera is None:
                 skipped[NO_POSE] += 1
                 continue
-        camera = _nearest(cameras, depth.time) or cameras[0]
         load = partial(_load, depth, colour, camera, T_world_camera, config.far)
         frames.append(Frame(depth.name, number, load, T_world_camera, depth.time))
+    if depths and not frames:
+        if colours:
+            _check_clock(path, depths, "colour images", (colours[0].time, colours[-1].time))
+        if poses is not None:
+            tree, world = poses
+            for child in (*tree.ancestors(depths[0].frame or cameras[0].frame), *tree.ancestors(world)):
+                if times := tree.times(child):
+                    _check_clock(path, depths, f"transforms of '{child}'", (min(times), max(times)))
     frames.sort(key=lambda frame: (frame.time, frame.number))
     return Dataset(path, frames, skipped, tuple(notes), is_video=True)
+
+
+def _check_clock(path: Path, depths: Sequence[TimedImage], what: str, others: tuple[int, int]) -> None:
+    """Refuse depth images more than a second before or after all others, given by their range [ns]."""
+    first, last = min(depth.time for depth in depths), max(depth.time for depth in depths)
+    if first > others[1] + SECOND or last < others[0] - SECOND:
+        late = (first - others[0]) / SECOND
+        reason = f"depth images and {what} share no time: the former begin {abs(late):.1f} s "
+        reason += f"{'later' if late > 0 else 'earlier'}; if recorded together, their clocks differ by that"
+        raise InputError(path, reason, "synchronise the clocks of all computers (or use_sim_time everywhere)")
 
 
 def _nearest(items: Sequence[Timed], time: int) -> Timed | None:
@@ -110,19 +135,24 @@ def _load(
     metres = depth.decode()
     size = metres.shape[::-1]
     shown = _described(size, depth.frame)
-    if camera.size not in (None, size) or camera.frame != depth.frame:
+    if camera.size not in (None, size) or _differ(camera.frame, depth.frame):
         others = _described(camera.size or size, camera.frame)
         reason = f"its images ({others}) differ from the depth images ({shown})"
         raise InputError(camera.name, reason, "give the camera of the depth images")
     rgb = None
     if colour is not None:
         rgb = colour.decode()
-        registered = _described(rgb.shape[1::-1], colour.frame)
-        if registered != shown:
+        if rgb.shape[1::-1] != size or _differ(colour.frame, depth.frame):
+            registered = _described(rgb.shape[1::-1], colour.frame)
             reason = f"depth ({shown}) is not registered to colour ({registered})"
             raise InputError(depth.name, reason, "give depth aligned to colour, or omit colour")
     near = np.where(metres <= far, metres, np.float32(0.0))
     return View(near, camera.K, T_world_camera, rgb, name=depth.name)
+
+
+def _differ(frame: str, other: str) -> bool:
+    """Whether two frames differ; one without a name contradicts nothing."""
+    return bool(frame and other) and frame != other
 
 
 def _described(size: tuple[int, ...], frame: str) -> str:
@@ -131,37 +161,47 @@ def _described(size: tuple[int, ...], frame: str) -> str:
 
 @dataclass
 class _Link:
-    """Poses of one frame over time: times [ns], parents, and translations with quaternions, w last.
+    """Poses of one frame in another over time: times [ns], and translations with quaternions, w last.
 
     Compact, because robots may record for hours.
     """
 
     times: array[int] = field(default_factory=lambda: array("q"))
-    parents: list[str] = field(default_factory=list)
     numbers: array[float] = field(default_factory=lambda: array("d"))
 
     @cached_property
-    def in_order(self) -> tuple[NDArray[np.int64], list[str], Array]:
-        """Ascending times, with parents and poses (N, 7); the last of equal times counts."""
+    def in_order(self) -> tuple[NDArray[np.int64], Array]:
+        """Ascending times, and poses (N, 7); the last of equal times counts."""
         times, last = np.unique(np.array(self.times)[::-1], return_index=True)
         order = len(self.times) - 1 - last
-        return times, [self.parents[i] for i in order], np.array(self.numbers).reshape(-1, 7)[order]
+        return times, np.array(self.numbers).reshape(-1, 7)[order]
 
 
 class TransformTree:
-    """Poses of frames in their parents over time, interpolated across gaps of at most `max_gap` [s]."""
+    """Poses of frames in their parents over time, interpolated across gaps of at most `max_gap` [s].
 
-    def __init__(self, max_gap: float) -> None:
+    A frame may have several parents, as when a driver and a calibration both publish it. Errors use the name.
+
+    Attributes:
+        moved: Frames that have several fixed poses in the same parent, and that parent.
+    """
+
+    def __init__(self, max_gap: float, name: str = "transforms") -> None:
+        self._name = name
         self._max_gap = round(max_gap * SECOND)
-        self._fixed: dict[str, tuple[str, Array]] = {}
-        self._links: defaultdict[str, _Link] = defaultdict(_Link)
+        self._fixed: defaultdict[str, dict[str, Array]] = defaultdict(dict)
+        self._links: defaultdict[str, dict[str, _Link]] = defaultdict(dict)
+        self.moved: dict[str, str] = {}
 
     @property
     def frames(self) -> list[str]:
         """Names of all frames."""
-        parents = {parent for link in self._links.values() for parent in link.parents}
-        parents |= {parent for parent, _ in self._fixed.values()}
-        return sorted({*self._links, *self._fixed} | parents)
+        children = {*self._links, *self._fixed}
+        return sorted(children.union(*map(self.parents, children)))
+
+    def times(self, frame: str) -> list[int]:
+        """All times [ns] of the poses of a frame; none if it is fixed."""
+        return [time for link in self._links.get(frame, {}).values() for time in link.times]
 
     def add(self, parent: str, child: str, time: int, pose: Sequence[float], *, fixed: bool = False) -> None:
         """Add the pose of a child in its parent at a time [ns], before the first query.
@@ -171,54 +211,78 @@ class TransformTree:
         """
         if fixed:
             rotation = Rotation.from_quat(pose[3:]).as_matrix()
-            self._fixed[child] = parent, transforms.rigid(rotation, pose[:3])
+            T_parent_child = transforms.rigid(rotation, pose[:3])
+            if not np.allclose(T_parent_child, self._fixed[child].get(parent, T_parent_child), atol=1e-3):
+                self.moved[child] = parent
+            self._fixed[child][parent] = T_parent_child
             return
-        link = self._links[child]
+        link = self._links[child].setdefault(parent, _Link())
         link.times.append(time)
-        link.parents.append(parent)
         link.numbers.extend(pose)
+
+    def parents(self, frame: str) -> list[str]:
+        """All parents of a frame, by name."""
+        return sorted({*self._links.get(frame, ()), *self._fixed.get(frame, ())})
+
+    def ancestors(self, frame: str) -> list[str]:
+        """The frame, its parents, their parents and so on, at any time."""
+        found = [frame]
+        for child in found:
+            found += [parent for parent in self.parents(child) if parent not in found]
+        return found
 
     def between(self, target: str, source: str, time: int) -> Array | None:
         """`T_target_source` (4, 4): the pose of one frame in another at a time [ns].
 
         Between two poses the rotation is interpolated along the shortest arc and the translation linearly.
         None if the frames are not connected, or a link has no pose around that time.
+
+        Raises:
+            InputError: A frame has two parents, and the two ways differ by more than a millimetre.
         """
-        T_up_source = dict(self._upwards(source, time))
-        for frame, T_frame_target in self._upwards(target, time):
-            if frame in T_up_source:
-                return transforms.invert(T_frame_target) @ T_up_source[frame]
-        return None
+        down = list(islice(self._upwards(target, time), MAX_WAYS))
+        up = islice(self._upwards(source, time, {frame for frame, _ in down}), MAX_WAYS)
+        ways = [
+            transforms.invert(T_frame_target) @ T_frame_source
+            for met, T_frame_source in up
+            for frame, T_frame_target in down
+            if frame == met
+        ]
+        if any(not np.allclose(T, ways[0], rtol=0.0, atol=1e-3) for T in ways[1:]):
+            above = (*self.ancestors(source), *self.ancestors(target))
+            twice = next(frame for frame in above if len(self.parents(frame)) > 1)
+            others = " and ".join(f"'{parent}'" for parent in self.parents(twice))
+            reason = f"frame '{twice}' has two parents, {others}, that place it differently"
+            raise InputError(self._name, reason, "record again with only one publisher of its transform")
+        return ways[0] if ways else None
 
-    def _upwards(self, frame: str, time: int) -> Iterator[tuple[str, Array]]:
-        """The frame and its known ancestors, each with the pose of `frame` in it."""
-        T_up_frame = np.eye(4)
-        met: set[str] = set()
-        while frame not in met:
-            yield frame, T_up_frame
-            met.add(frame)
-            step = self._step(frame, time)
-            if step is None:
-                return
-            frame, T_parent_child = step
-            T_up_frame = T_parent_child @ T_up_frame
+    def _upwards(self, frame: str, time: int, ends: Collection[str] = ()) -> Iterator[tuple[str, Array]]:
+        """The frame and its ancestors up to any of `ends`, by each way, with the pose of `frame` in them."""
+        ways: list[tuple[str, Array, tuple[str, ...]]] = [(frame, np.eye(4), ())]
+        while ways:
+            child, T_child_frame, met = ways.pop()
+            yield child, T_child_frame
+            for parent in self.parents(child)[::-1] if child not in ends else ():
+                T_parent_child = self._step(child, parent, time)
+                if T_parent_child is not None and parent not in met:
+                    ways.append((parent, T_parent_child @ T_child_frame, (*met, child)))
 
-    def _step(self, child: str, time: int) -> tuple[str, Array] | None:
-        """Parent of a frame and its pose in it at a time, or None if unknown."""
-        if child not in self._links:
-            return self._fixed.get(child)
-        times, parents, poses = self._links[child].in_order
+    def _step(self, child: str, parent: str, time: int) -> Array | None:
+        """The pose of a frame in its parent at a time, or None if unknown."""
+        if parent not in self._links.get(child, ()):
+            return self._fixed[child][parent]
+        times, poses = self._links[child][parent].in_order
         stop = int(np.searchsorted(times, time))
         if stop == len(times):
             return None
         start = stop if times[stop] == time else stop - 1
         gap = int(times[stop] - times[start])
-        if start < 0 or parents[start] != parents[stop] or gap > self._max_gap:
+        if start < 0 or gap > self._max_gap:
             return None
         share = (time - int(times[start])) / max(gap, 1)
         turn = Slerp((0.0, 1.0), Rotation.from_quat(poses[[start, stop], 3:]))
         position = (1.0 - share) * poses[start, :3] + share * poses[stop, :3]
-        return parents[stop], transforms.rigid(turn(share).as_matrix(), position)
+        return transforms.rigid(turn(share).as_matrix(), position)
 
 
 def is_pose(numbers: Sequence[float]) -> bool:
