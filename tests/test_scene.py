@@ -98,6 +98,21 @@ def test_thin_things_with_masks_lie_flat_on_the_table():
         assert o.centre_world[2] == pytest.approx(TABLE, abs=0.005)
 
 
+def test_thin_things_on_others_end_where_those_begin():
+    sizes = {1: (0.2, 0.2, 0.12), 2: (0.085, 0.054, 0.001), 3: (0.25, 0.2, 0.006), 4: (0.12, 0.03, 0.003)}
+    lows = {1: TABLE, 2: TABLE + 0.12, 3: TABLE, 4: TABLE + 0.006}
+    places = {1: (0.0, -0.15), 2: (0.02, -0.15), 3: (0.0, 0.2), 4: (0.03, 0.2)}
+    boxes = [(np.array([*places[k], lows[k] + size[2] / 2.0]), np.array(size)) for k, size in sizes.items()]
+    model = Scene(segmentation="labels")
+    for azimuth in (20.0, 140.0, 260.0):
+        view = table_scene(from_the_side(azimuth, 45.0, 1.2), boxes, sigma=0.0005, seed=int(azimuth))
+        model.update(view.every(2))
+    assert edges(model.graph) == {("o0", "o1"), ("o1", "o2"), ("o0", "o3"), ("o3", "o4")}
+    for o in (model.graph["o2"], model.graph["o4"]):
+        assert o.shape.extents.min() < 0.005
+        assert o.centre_world[2] == pytest.approx(lows[o.label], abs=0.005)
+
+
 def renumbered(views, rng):
     """The same masks, numbered at random in every view."""
     numbers = [np.append(0, 1 + rng.permutation(30)).astype(np.int32) for _ in views]
