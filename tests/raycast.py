@@ -19,8 +19,9 @@ def table_scene(
     sigma: float = 0.0,
     seed: int = 0,
     half_table: tuple[float, float] = (0.3, 0.45),
+    floor: float = 0.0,
 ) -> View:
-    """Show a floor at 0, a table top at 0.75 m, and boxes and spheres on it labelled 1, 2, … in order.
+    """Show a floor, a table top at 0.75 m, and boxes and spheres on it labelled 1, 2, … in order.
 
     Boxes are (centre, extents) along the axes, spheres (centre, radius), all in metres;
     `sigma` is the noise of inverse depth [1/m].
@@ -31,7 +32,7 @@ def table_scene(
     eye = T_world_camera[:3, 3]
     depth, labels = np.full(u.shape, np.inf), np.zeros(u.shape, dtype=np.int32)
     with np.errstate(divide="ignore", invalid="ignore"):
-        solids = [np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], np.inf)]
+        solids = [np.where(rays[..., 2] < 0, (floor - eye[2]) / rays[..., 2], np.inf)]
         top = (np.array([0.0, 0.0, TABLE - 0.02]), np.array([2 * half_table[0], 2 * half_table[1], 0.04]))
         for centre, extents in [top, *boxes]:
             a = (np.asarray(centre) - np.asarray(extents) / 2.0 - eye) / rays

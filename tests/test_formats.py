@@ -336,11 +336,18 @@ def test_missing_readings_are_dropped_and_labels_spread_back(tmp_path_factory, m
     assert not back[gone].any()
 
 
-@pytest.mark.parametrize(("value", "kind"), [(-1, "<i4"), (0.5, "<f4"), (np.nan, "<f4"), (65535, "<u4")])
+@pytest.mark.parametrize(("value", "kind"), [(-2, "<i4"), (0.5, "<f4"), (np.nan, "<f4"), (65534, "<u4")])
 def test_labels_that_are_no_object_numbers_are_refused(tmp_path, value, kind):
     data = np.zeros(6, list((TYPES | {"label": kind}).items()))
     data["z"], data["label"] = 1.0, value
     refused(write(tmp_path / "a.pcd", data), "label")
+
+
+@pytest.mark.parametrize(("value", "kind"), [(-1, "<i4"), (2**32 - 1, "<u4"), (65535, "<u2")])
+def test_numbers_that_others_give_to_nothing_are_read(tmp_path, value, kind):
+    data = np.zeros(6, list((TYPES | {"label": kind}).items()))
+    data["z"], data["label"] = 1.0, value
+    assert not read_stored_cloud(write(tmp_path / "a.pcd", data)).labels.any()
 
 
 def test_odd_but_honest_files_are_read(tmp_path):

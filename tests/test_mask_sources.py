@@ -82,6 +82,20 @@ def test_a_models_masks_are_segments_of_the_view_at_its_own_size(channels):
     assert not black.labels.any()
 
 
+@pytest.mark.parametrize("name", ["depth", "xyz"])
+def test_a_model_may_need_no_colour(name, tmp_path):
+    """Its only mask is the nearest fifth of the image."""
+    view = replace(simulated_views("tower")[0], rgb=None, labels=None)
+    most = np.quantile(view.depth, 0.2)
+    split = helper.make_node("Split", ["xyz"], ["x", "y", "z"], axis=1)
+    less = helper.make_node("Less", ["depth" if name == "depth" else "z", "most"], ["masks"])
+    nodes, channels = ([less], 1) if name == "depth" else ([split, less], 3)
+    size = (1, channels, HEIGHT, WIDTH)
+    model = write_model(tmp_path / "model.onnx", nodes, {name: size}, [("most", most)])
+    masked = mask_source(model, Config())(view)
+    assert np.mean((masked.labels > 0) == (view.depth < most)) > 0.98
+
+
 def test_our_own_segments_are_a_models_prompts(boxed):
     view = simulated_views("tower", vga=True)[0]
     masked = mask_source(boxed, Config())(replace(view, labels=None))

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 import pytest
 from raycast import TABLE, from_the_side, table_scene
+from scipy import ndimage
 from synthetic import (
     TABLE_TOP,
     config_for,
@@ -98,6 +99,21 @@ def test_thin_things_with_masks_lie_flat_on_the_table():
         assert o.centre_world[2] == pytest.approx(TABLE, abs=0.005)
 
 
+def test_thin_things_on_others_end_where_those_begin():
+    sizes = {1: (0.2, 0.2, 0.12), 2: (0.085, 0.054, 0.001), 3: (0.25, 0.2, 0.006), 4: (0.12, 0.03, 0.003)}
+    lows = {1: TABLE, 2: TABLE + 0.12, 3: TABLE, 4: TABLE + 0.006}
+    places = {1: (0.0, -0.15), 2: (0.02, -0.15), 3: (0.0, 0.2), 4: (0.03, 0.2)}
+    boxes = [(np.array([*places[k], lows[k] + size[2] / 2.0]), np.array(size)) for k, size in sizes.items()]
+    model = Scene(segmentation="labels")
+    for azimuth in (20.0, 140.0, 260.0):
+        view = table_scene(from_the_side(azimuth, 45.0, 1.2), boxes, sigma=0.0005, seed=int(azimuth))
+        model.update(view.every(2))
+    assert edges(model.graph) == {("o0", "o1"), ("o1", "o2"), ("o0", "o3"), ("o3", "o4")}
+    for o in (model.graph["o2"], model.graph["o4"]):
+        assert o.shape.extents.min() < 0.005
+        assert o.centre_world[2] == pytest.approx(lows[o.label], abs=0.005)
+
+
 def renumbered(views, rng):
     """The same masks, numbered at random in every view."""
     numbers = [np.append(0, 1 + rng.permutation(30)).astype(np.int32) for _ in views]
@@ -130,9 +146,61 @@ def test_a_mask_of_the_table_is_the_table(floor, caplog):
     ]
     scene = model_of(numbered)
     assert graph_text(scene.graph) == graph_text(model_of(views).graph)
-    assert "label 99 covers the table, and is taken for it" in caplog.text
+    assert caplog.messages == ["tower view 1: label 99 is the table, which it covers, and no object"]
     background = [replace(v, labels=np.where(v.labels == 0, -1, v.labels)) for v in views]
     assert graph_text(model_of(background).graph) == graph_text(scene.graph)
+
+
+def around(view, width):
+    """Which pixels lie within a width [px] of an object, outside it."""
+    labels, mark = view.labels, np.zeros(view.labels.shape, dtype=bool)
+    for k in np.unique(labels[labels > 0]):
+        mark |= ndimage.binary_dilation(labels == k, iterations=width) & (labels != k)
+    return mark
+
+
+VOIDS = {
+    "border": lambda v: np.where(around(v, 2), 255, v.labels),
+    "rest": lambda v: np.where(v.labels == 0, 255, v.labels),
+    "16 bits": lambda v: np.where(v.labels == 0, SUPPORT_LABEL, v.labels),
+}
+OBJECTS = {
+    "one of many numbers": lambda v: np.where(v.labels > 0, v.labels + 253, 0),
+    "alone": lambda v: np.where(v.labels == 1, 255, 0),
+    "one beside others": lambda v: np.where(v.labels == 2, 255, v.labels),
+}
+
+
+@pytest.mark.parametrize("how", VOIDS)
+def test_void_is_no_object(how, caplog):
+    views = simulated_views("tower")
+    scene = model_of([replace(view, labels=VOIDS[how](view)) for view in views])
+    if how == "border":  # pixels that it covers are missing
+        views = [replace(v, labels=np.where(around(v, 2), 0, v.labels)) for v in views]
+    assert graph_text(scene.graph) == graph_text(model_of(views).graph)
+    said = ["tower view 1: label 255 is void, around the others, and no object"]
+    assert caplog.messages == ([] if how == "16 bits" else said)
+
+
+@pytest.mark.parametrize("how", OBJECTS)
+def test_an_object_may_be_number_255(how, caplog):
+    views = [replace(view, labels=OBJECTS[how](view)) for view in simulated_views("tower")]
+    assert "o255" in model_of(views).graph
+    assert not caplog.messages
+
+
+@pytest.mark.parametrize("height", [0.2, 0.45])
+def test_a_mask_of_a_low_table_beside_its_floor_is_the_table(height, caplog):
+    box = (np.array([0.0, 0.0, TABLE + 0.05]), np.array([0.1, 0.1, 0.1]))
+    scene = Scene(segmentation="labels")
+    for azimuth in (20.0, 140.0):
+        view = table_scene(from_the_side(azimuth, 45.0, 1.3), [box], floor=TABLE - height).every(2)
+        points = transforms.transform(view.pose, view.points_camera)
+        top = view.valid & (view.labels == 0) & (points[..., 2] > TABLE - 0.03)
+        scene.update(replace(view, labels=np.select([top, view.labels > 0], [1, 2])))
+    assert edges(scene.graph) == {("o0", "o2")}
+    assert scene.graph["o2"].shape.extents == pytest.approx([0.1] * 3, abs=0.01)
+    assert len(caplog.messages) == 1
 
 
 def test_masks_whose_numbers_mean_nothing_are_noticed(caplog):
@@ -170,6 +238,11 @@ def without_depth(view):
     return replace(view, depth=np.where(view.labels == 1, np.float32(0.0), view.depth))
 
 
+def smoothed(view):
+    """Labels resized like a picture."""
+    return replace(view, labels=np.rint(ndimage.gaussian_filter(40.0 * view.labels, 1.5)).astype(np.int32))
+
+
 def cropped(view):
     """Only 20 cm of the table, in its middle."""
     far = np.abs(transforms.transform(view.pose, view.points_camera)[..., :2]).max(axis=-1) > 0.1
@@ -181,6 +254,7 @@ def cropped(view):
     [
         (lambda view: view, ""),
         (near, "10000 readings nearer than cloud.min_depth = 0.1 m are ignored"),
+        (smoothed, "labels are slivers, as if interpolated; resize them by nearest neighbours"),
         (without_depth, "too few depth readings in mask 1; its object is missed"),
         (cropped, "the support surface is only 0.19 m wide"),
         (

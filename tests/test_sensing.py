@@ -12,7 +12,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Sphere
 from caryatid.sensing.clouds import average_pixels, estimate_normals, oriented_points
 from caryatid.sensing.masks import labels_from_masks
-from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, View
+from caryatid.sensing.views import MAX_LABEL, View
 from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
 
 # Views
@@ -54,7 +54,7 @@ def test_missing_readings_are_zero_whether_given_as_zero_or_nan():
         ({"labels": np.zeros((4, 4), dtype=np.int32)}, "labels is 4×4, depth is 5×4"),
         ({"normals_camera": np.zeros((3, 5, 3))}, "normals_camera is 5×3"),
         ({"labels": np.full((4, 5), -2)}, "labels exceed"),
-        ({"labels": np.full((4, 5), SUPPORT_LABEL)}, "labels exceed"),
+        ({"labels": np.full((4, 5), MAX_LABEL + 1)}, "labels exceed"),
     ],
 )
 def test_a_view_that_makes_no_sense_is_refused_by_name_and_reason(fields, reason):

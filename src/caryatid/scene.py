@@ -129,6 +129,7 @@ class Scene(Pictured):
         self._detector = ChangeDetector()
         self._labelled: bool | None = None
         self._names: dict[str, dict[str, int]] = {}
+        self._notes: frozenset[str] = frozenset()
 
     @property
     def surface(self) -> SupportSurface | None:
@@ -404,6 +405,9 @@ class Scene(Pictured):
             else:  # masks show what has no depth
                 self._check_holes(observation.view, observation.surface)
         self._check_found(observation, source.name, masks=given)
+        for note in sorted({*observation.notes} - self._notes):
+            log.warning("%s: %s", source.name, note)
+        self._notes |= {*observation.notes}
         if not self.views:
             check_size(source.name, observation.surface, self.config.surface)
         watch.lap("segment")

@@ -77,11 +77,13 @@ def without_ignored(view: View, ignore: Path, max_pixels: int) -> View:
 class OnnxMasks:
     """A class-agnostic instance segmenter as an ONNX model, run on the CPU.
 
-    Inputs are float32 and have names. If H and W are fixed, images are resized.
+    Inputs are float32 and have names; all are optional, but not the first three together. If H and W are
+    fixed, images are resized.
 
     * `image` (1, 3, H, W): RGB in [0, 1].
-    * `xyz` (1, 3, H, W), optional: points in the camera frame [m], 0 where there is no reading.
-    * `boxes` (N, 4), optional: x, y of two corners [px] around our own automatic segments, as prompts.
+    * `depth` (1, 1, H, W): depth along the optical axis [m], 0 where there is no reading.
+    * `xyz` (1, 3, H, W): points in the camera frame [m], 0 where there is no reading.
+    * `boxes` (N, 4): x, y of two corners [px] around our own automatic segments, as prompts.
 
     Outputs are `masks` and, optionally, `scores` (N,). Masks are (N, H, W), with any extra axes of length 1:
     boolean, scores in [0, 1], or logits, which are above 0 in the mask.
@@ -103,13 +105,13 @@ class OnnxMasks:
         self._path, self._config, self._seed = path, config, seed
         inputs = {i.name: i for i in self._session.get_inputs()}
         outputs = [o.name for o in self._session.get_outputs()]
-        unknown = sorted(inputs.keys() - {"image", "xyz", "boxes"})
-        if "image" not in inputs or "masks" not in outputs or unknown:
+        images = [name for name in ("image", "depth", "xyz") if name in inputs]
+        if not images or "masks" not in outputs or inputs.keys() - {*images, "boxes"}:
             reason = f"has inputs {', '.join(inputs)} and outputs {', '.join(outputs)}"
-            remedy = "export it with inputs image (and xyz, boxes) and outputs masks (and scores)"
+            remedy = "export it with inputs image, depth or xyz (and boxes) and outputs masks (and scores)"
             raise InputError(path, reason, remedy)
         self._inputs, self._outputs = set(inputs), [o for o in ("masks", "scores") if o in outputs]
-        height, width = inputs["image"].shape[2:]
+        height, width = inputs[images[0]].shape[2:]
         fixed = isinstance(height, int) and isinstance(width, int)
         self._size: tuple[int, int] | None = (height, width) if fixed else None
 
@@ -117,17 +119,20 @@ class OnnxMasks:
         """Return the view with the masks of the model.
 
         Raises:
-            InputError: It has no colour, or the model fails or does not return masks.
+            InputError: It lacks colour that the model requires, or the model fails or does not return masks.
         """
-        if view.rgb is None:
-            raise InputError(view.name, "has no colour image, which the model requires", "record colour")
         height, width = self._size or view.depth.shape
-        image = Image.fromarray(view.rgb).resize((width, height), Image.Resampling.BILINEAR)
-        rgb = np.asarray(image, dtype=np.float32) / np.float32(255.0)
-        given = {"image": rgb.transpose(2, 0, 1)[None]}
+        nearest, given = _pixels((height, width), view.depth.shape), dict[str, NDArray[np.float32]]()
+        if "image" in self._inputs:
+            if view.rgb is None:
+                raise InputError(view.name, "has no colour image, which the model requires", "record colour")
+            image = Image.fromarray(view.rgb).resize((width, height), Image.Resampling.BILINEAR)
+            rgb = np.asarray(image, dtype=np.float32) / np.float32(255.0)
+            given["image"] = rgb.transpose(2, 0, 1)[None]
+        if "depth" in self._inputs:
+            given["depth"] = view.depth[nearest][None, None]
         if "xyz" in self._inputs:
-            xyz = view.points_camera.astype(np.float32)
-            given["xyz"] = xyz[_pixels((height, width), view.depth.shape)].transpose(2, 0, 1)[None]
+            given["xyz"] = view.points_camera.astype(np.float32)[nearest].transpose(2, 0, 1)[None]
         if "boxes" in self._inputs:
             scale = np.array([width, height] * 2) / np.array([*view.depth.shape[::-1]] * 2)
             given["boxes"] = (self._prompts(view) * scale).astype(np.float32)

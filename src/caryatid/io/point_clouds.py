@@ -19,10 +19,12 @@ from caryatid.geometry.transforms import Array
 from caryatid.io.datasets import find_sample
 from caryatid.io.staging import read_errors
 from caryatid.sensing.clouds import estimate_normals
-from caryatid.sensing.views import MAX_LABEL, Cloud
+from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud
 
 Columns = dict[str, NDArray[Any]]
 """Fields of one value per point (N,)."""
+NOTHING = (-1.0, SUPPORT_LABEL, 2.0**32 - 1.0)
+"""Labels of no object beside 0: −1, in 32 bits without a sign too, and void in 16 bits."""
 
 
 _PCD_DEFAULTS: Final = {"SIZE": "4", "TYPE": "F", "COUNT": "1"}
@@ -212,6 +214,7 @@ def _labels(columns: Columns, divisor: int, path: Path) -> NDArray[np.int32] | N
     if "label" not in columns:
         return None
     raw = columns["label"].astype(np.float64)
+    raw[np.isin(raw, NOTHING)] = 0.0
     labels = raw // divisor
     if not ((raw >= 0.0) & (raw == np.floor(raw)) & (labels <= MAX_LABEL)).all():
         reason = f"labels are not all integers from 0 to {divisor * (MAX_LABEL + 1) - 1}"

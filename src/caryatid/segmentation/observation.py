@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from caryatid.segmentation.samples import Labels
 from caryatid.segmentation.seams import Pairs
 from caryatid.segmentation.segments import SMALLEST, segment, segment_cloud
 from caryatid.segmentation.support_plane import SupportSurface, find_support_surfaces, find_surface_below
+from caryatid.segmentation.void import VOID, is_void
 from caryatid.sensing.clouds import average_pixels, oriented_points, thin, working_distance
 from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View
 
@@ -30,8 +30,6 @@ WHOLE = 0.1
 ALONE = 0.7
 """Share of the points on the table's plane that a mask of the table has, and share of its points there [1]; a
 flat object leaves more of the table to see."""
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,6 +42,7 @@ class Observation:
         pixels: Flat index (N,) of each point in the image, or in the cloud it came from.
         surfaces: The support surfaces as this view shows them, the main one first.
         apart: Pairs (P, 2) of labels, as `observe` gives them, that this view shows to be two bodies.
+        notes: What is to be said about given labels.
     """
 
     view: View | None
@@ -51,6 +50,7 @@ class Observation:
     pixels: NDArray[np.intp]
     surfaces: tuple[SupportSurface, ...]
     apart: NDArray[np.int32]
+    notes: tuple[str, ...] = ()
 
     @property
     def surface(self) -> SupportSurface:
@@ -141,13 +141,15 @@ def observe(
     if isinstance(source, View) and source.depth.shape[1] < SMALLEST * config.segmentation.stride:
         # Too few samples would leave the network out.
         config = replace(config, segmentation=replace(config.segmentation, stride=1))
+    whole = source
     if use_labels and isinstance(source, View):
         source = _with_whole_masks(source, 2.0 * config.segmentation.edge_jump)
     cloud, pixels = _points(source, config, known)
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     pose = source.T_world_camera if isinstance(source, View) else None
+    notes: tuple[str, ...] = ()
     if given is not None:
-        given = _without_table(cloud, given, known, UP, config, rng, pose)
+        given, notes = _without_others(whole, cloud, given, known, UP, config, rng, pose)
     surfaces = _find_surfaces(cloud, given, known, UP, config, rng, pose)
     if isinstance(source, View):
         # A level face no larger than an object and closed below is the top of an object.
@@ -172,7 +174,7 @@ def observe(
         on_surface = (labels == 0) & surface.over(cloud.points_world, -reach, reach, reach)
         labels = np.where(on_surface, np.int32(SUPPORT_LABEL - k), labels)
     view = source if isinstance(source, View) else None
-    return Observation(view, replace(cloud, labels=labels), pixels, surfaces, apart)
+    return Observation(view, replace(cloud, labels=labels), pixels, surfaces, apart, notes)
 
 
 def segment_view(
@@ -305,12 +307,13 @@ def level_transform(
     pose = np.eye(4)  # the source is in the frame of its camera
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     if given is not None:
-        given = _without_table(cloud, given, (), None, config, rng, pose)
+        given, _ = _without_others(source, cloud, given, (), None, config, rng, pose)
     surface = _find_surfaces(cloud, given, (), None, config, rng, pose)[0]
     return transforms.level_world(surface.normal_world, surface.point_world)
 
 
-def _without_table(
+def _without_others(
+    source: View | Cloud,
     cloud: Cloud,
     given: NDArray[np.int32],
     known: Sequence[SupportSurface],
@@ -318,34 +321,40 @@ def _without_table(
     config: Config,
     rng: np.random.Generator,
     T_world_camera: Array | None,
-) -> NDArray[np.int32]:
-    """Labels (N,) without that of the table, if its points have one, as segmenters of whole images give it.
+) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+    """Remove labels of no objects, as segmenters of whole images give them: of surfaces, and void.
 
-    In a first view, labels are asked only if no other points show a table, or only a floor far below them.
+    In a first view, a label is a surface's if no other points show one, or only a floor far below; or if it
+    is larger than objects are.
+
+    Returns:
+        Labels (N,), and what is to be said about them.
     """
-    surface = known[0] if known else None
+    surfaces, shown = list(known), False
     apart = copy.deepcopy(rng)  # The same view without that label gives the same scene.
     if not known:
         with suppress(NoSurfaceError):
             found = _find_surfaces(cloud, given, (), up, config, apart, T_world_camera)[0]
             heights = found.height(cloud.points_world[given > 0])
-            if np.count_nonzero(heights > config.segmentation.max_height) < config.surface.min_points:
-                return given
+            high = int(np.count_nonzero(heights > config.segmentation.max_height))
+            shown = high < config.surface.min_points
         with suppress(NoSurfaceError):
-            surface = _find_surfaces(cloud, None, (), up, config, apart, T_world_camera)[0]
-    if surface is None:
-        return given
-    reach = config.surface.tolerance
-    on_surface = surface.over(cloud.points_world, -reach, reach, 0.0)
-    if not on_surface.any():
-        return given
-    covered = np.bincount(given[on_surface])
-    label = int(np.argmax(covered))
-    flat = covered[label] > ALONE * np.count_nonzero(given == label)
-    if label == 0 or not flat or covered[label] < ALONE * np.count_nonzero(on_surface):
-        return given
-    log.warning("%s: label %d covers the table, and is taken for it; give it 0", cloud.name, label)
-    return np.where(given == label, np.int32(0), given)
+            surfaces = list(_find_surfaces(cloud, None, (), up, config, apart, T_world_camera))
+    reach, others = config.surface.tolerance, dict[int, str]()
+    for k, surface in enumerate(surfaces):
+        if not known and (k or shown) and surface.shape.extents.max() <= config.fit.max_extent:
+            continue
+        on_surface = surface.over(cloud.points_world, -reach, reach, 0.0)
+        covered = np.bincount(given[on_surface], minlength=1)
+        label = int(np.argmax(covered))
+        whole = covered[label] > ALONE * np.count_nonzero(given == label)
+        if label and whole and covered[label] >= ALONE * np.count_nonzero(on_surface):
+            what = "a support surface" if k else "the table"
+            others[label] = f"label {label} is {what}, which it covers, and no object"
+    assert source.labels is not None
+    if is_void(source, np.where(np.isin(source.labels, [*others.keys() - {VOID}]), 0, source.labels)):
+        others[VOID] = f"label {VOID} is void, around the others, and no object"
+    return np.where(np.isin(given, [*others]), np.int32(0), given), tuple(others.values())
 
 
 def _find_surfaces(

@@ -35,7 +35,7 @@ class View(Pictured):
         K: Pinhole matrix (3, 3) [px].
         T_world_camera: Camera pose (4, 4), OpenCV camera frame, or None if unknown.
         rgb: Colour (H, W, 3) uint8, or None.
-        labels: Object number of each pixel (H, W), 0 or −1 = nothing, or None without segmentation. A
+        labels: Object number of each pixel (H, W), 0, −1 or 65535 = nothing, or None without segmentation. A
             stack of masks (N, H, W), boolean or scores in [0, 1], becomes such an image of segments.
         normals_camera: Surface normals (H, W, 3) in the camera frame, or None to estimate them from depth.
         name: What to call the view in messages.
@@ -161,7 +161,7 @@ class Cloud(Pictured):
     Attributes:
         points_world: (N, 3) [m].
         normals_world: Normals (N, 3) that point towards the sensor; a scene scales them to length 1.
-        labels: Object number of each point (N,), 0 or −1 = nothing, or None.
+        labels: Object number of each point (N,), 0, −1 or 65535 = nothing, or None.
         rgb: (N, 3) uint8, or None.
         viewpoint_world: Where the sensor was (3,) [m], or None.
         name: What to call the cloud in messages.
@@ -256,7 +256,9 @@ def check_intrinsics(K: Array, name: str) -> Array:
 
 
 def check_labels(labels: NDArray[Any], name: str) -> NDArray[Any]:
-    """Check labels (...) and return them (...) with 0 for the background, which many segmenters number −1.
+    """Check labels (...) and return them (...) with 0 for the background, which many number −1.
+
+    65535, void in 16 bits and the support surface in label images of ours, is background too.
 
     Raises:
         InputError: They are not integers, or out of range.
@@ -266,10 +268,11 @@ def check_labels(labels: NDArray[Any], name: str) -> NDArray[Any]:
         raise InputError(name, "labels are not integers", remedy)
     if not labels.size or (labels.min() >= 0 and labels.max() <= MAX_LABEL):
         return labels
-    if labels.min() < -1 or labels.max() > MAX_LABEL:
-        remedy = "number objects from 1, 0 or −1 = no object"
+    nothing = (labels == -1) | (labels == SUPPORT_LABEL)
+    if ((labels < 0) | (labels > MAX_LABEL))[~nothing].any():
+        remedy = f"number objects from 1, 0, −1 or {SUPPORT_LABEL} = no object"
         raise InputError(name, f"labels exceed 0…{MAX_LABEL}", remedy)
-    return np.where(labels == -1, 0, labels)
+    return np.where(nothing, 0, labels)
 
 
 def _numbers(values: Any, dtype: DTypeLike | None, name: str) -> NDArray[Any]:
