@@ -181,7 +181,7 @@ class Node(Door):
         self.seen.append(replace(view, T_world_camera=T_world_camera, labels_are="segments"))
         self.exploration.begin(make("caryatid_msgs/action/Explore/Goal"))
         depth, colour = image(view.depth, "32FC1", time), image(view.rgb, "rgb8", time)
-        self.exploration.look(depth, camera_info(view), colour, transform)
+        self.exploration.look(depth, camera_info(view), {"colour": colour}, transform)
         return self.graph()
 
     def take(self, object_id, T=None):

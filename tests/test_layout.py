@@ -165,14 +165,19 @@ SCENES = {
     "myosuite": (
         MYOSUITE,
         {("table", "Object")},
-        ["starts from none of its keyframes up, low; --keyframe chooses", "robot 'myo_base' (2 joints)"],
+        [
+            "starts from none of its keyframes up, low; --keyframe chooses",
+            "body 'Object' is free: a free joint replaces its slides and hinges",
+            "robot 'myo_base' (2 joints)",
+        ],
     ),
     "adroit": (
         ADROIT,
         {("table", "Object")},
         [
+            "body 'Object' is free: a free joint replaces its slides and hinges",
             "robot 'forearm' (6 joints) and body 'nail_board' (1 joint) are held still and are no objects: "
-            f"{NEEDS}"
+            f"{NEEDS}",
         ],
     ),
     "fetch": (

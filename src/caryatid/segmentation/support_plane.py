@@ -86,7 +86,7 @@ class Region:
 
     def holds(self, places: Array) -> Mask:
         """Whether places (N, 2) [m], or the x and y of points (N, 3), are in it."""
-        return _held(places, self.corner, self.squares, self.size)
+        return _held(np.ascontiguousarray(places), self.corner, self.squares, self.size)
 
     def places(self) -> Array:
         """Centres (N, 2) of its squares [m]."""
@@ -114,7 +114,7 @@ class Region:
     def trimmed(self) -> Region:
         """The same squares on the smallest grid that holds them."""
         x, y = (np.flatnonzero(self.squares.any(axis=k)) for k in (1, 0))
-        part = self.squares[x[0] : x[-1] + 1, y[0] : y[-1] + 1]
+        part = np.ascontiguousarray(self.squares[x[0] : x[-1] + 1, y[0] : y[-1] + 1])
         return Region(self.corner + (x[0], y[0]), part, self.size)
 
     def joined(self, other: Region) -> Region:
@@ -168,8 +168,8 @@ class SupportSurface:
         Their height is between low and high [m].
         """
         own = self.region.grown(margin)
-        grid = own.corner, own.squares, own.size
-        return _over(points_world, self.normal_world, self.point_world, low, high, *grid)
+        arrays = map(np.ascontiguousarray, (points_world, self.normal_world, self.point_world))
+        return _over(*arrays, float(low), float(high), own.corner, own.squares, own.size)
 
     def pixels_over(
         self, view: View, low: float, high: float, margin: float = np.inf, *, core: bool = False
@@ -582,7 +582,7 @@ def _grown(region: Region, margin: float) -> Region:
     squares, size = region.squares, region.size
     if margin < 0.0:
         depth = ndimage.distance_transform_edt(np.pad(squares, 1))[1:-1, 1:-1]
-        return replace(region, squares=depth * size > size / 2.0 - margin)
+        return replace(region, squares=np.ascontiguousarray(depth * size > size / 2.0 - margin))
     border = min(int(np.ceil(margin / size)), WIDEST)
     squares = np.pad(squares, border)
     if border:
