@@ -20,6 +20,7 @@ from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
 from caryatid.graph import SupportGraph
+from caryatid.io.cloud_frames import level_cloud
 from caryatid.io.datasets import (
     Dataset,
     Frame,
@@ -36,7 +37,6 @@ from caryatid.io.point_clouds import read_stored_cloud
 from caryatid.robots import HUMANOID, Robot, find_robot
 from caryatid.robots.protocol import RecordingCamera, RecordingRobot
 from caryatid.scene import KEPT, LEFT_OUT
-from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import Camera
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.sessions.session import Session, is_session
@@ -281,9 +281,7 @@ def extract(
         raise InputError(source, "has no field label", "use --segmentation auto")
     if use_labels and stored.labels is not None:
         _check_segments(source, Counter(stored.labels[stored.kept].tolist()), config)
-    cloud = stored.to_cloud(config.cloud)
-    rng = np.random.default_rng(seed)
-    cloud = cloud.moved(level_transform(cloud, config, rng, use_labels=use_labels))
+    cloud = level_cloud(stored, config, np.random.default_rng(seed), use_labels=use_labels)
     return (replace(step, labels=stored.spread(step.labels)) for step in map(explorer.look, [cloud]))
 
 

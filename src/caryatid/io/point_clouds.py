@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
@@ -40,7 +41,8 @@ class StoredCloud:
         normals: (N, 3) as stored, or None.
         labels: Object number of each point (N,), 0 = nothing, or None.
         rgb: (N, 3) uint8, or None.
-        viewpoint: Position of the sensor (3,) [m]; the origin if the file does not say.
+        T_world_sensor: Pose (4, 4) of the sensor by the file; the identity if it does not say. Some programs
+            store points in the frame of the sensor, others in that of the world.
         name: The file.
     """
 
@@ -48,13 +50,15 @@ class StoredCloud:
     normals: Array | None
     labels: NDArray[np.int32] | None
     rgb: NDArray[np.uint8] | None
-    viewpoint: Array
+    T_world_sensor: Array
     name: str
 
     @property
     def kept(self) -> NDArray[np.bool_]:
         """Which points (N,) are readings: finite, and not at the sensor's own centre."""
-        return np.isfinite(self.points).all(axis=1) & (self.points != self.viewpoint).any(axis=1)
+        centres = np.zeros(3), self.T_world_sensor[:3, 3]
+        apart = [(self.points != centre).any(axis=1) for centre in centres]
+        return np.isfinite(self.points).all(axis=1) & apart[0] & apart[1]
 
     def spread(self, values: NDArray[np.int32]) -> NDArray[np.int32]:
         """Spread values of the readings (M,) over all stored points (N,); 0 without a reading."""
@@ -63,20 +67,27 @@ class StoredCloud:
         result[kept] = values
         return result
 
-    def to_cloud(self, config: CloudConfig) -> Cloud:
+    def to_cloud(self, config: CloudConfig, T_sensor_file: Array | None = None) -> Cloud:
         """Keep the readings and give them normals.
 
         Stored normals are used, scaled to length 1. If the file has none, or not for every reading, all are
-        estimated from neighbours and point to the viewpoint. Frame and order are those of the file.
+        estimated from neighbours and point to the sensor.
+
+        Args:
+            config: How normals are estimated.
+            T_sensor_file: Transform (4, 4) to the frame of the sensor, which is the viewpoint. None = keep the
+                frame of the file; normals are estimated as if the sensor were at the origin.
         """
-        kept = self.kept
-        points = self.points[kept]
+        kept, T = self.kept, np.eye(4) if T_sensor_file is None else T_sensor_file
+        points, eye = transforms.transform(T, self.points[kept]), np.zeros(3)
         normals = None if self.normals is None else transforms.unit(self.normals[kept])
         if normals is None or not (np.isfinite(normals).all() and (normals != 0.0).any(axis=1).all()):
-            normals = estimate_normals(points, self.viewpoint, config.neighbours)
+            normals = estimate_normals(points, eye, config.neighbours)
+        elif T_sensor_file is not None:
+            normals = transforms.rotate(T, normals)
         labels = None if self.labels is None else self.labels[kept]
         rgb = None if self.rgb is None else self.rgb[kept]
-        return Cloud(points, normals, labels, rgb, self.viewpoint, self.name)
+        return Cloud(points, normals, labels, rgb, eye if T_sensor_file is not None else None, self.name)
 
 
 def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
@@ -98,7 +109,7 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
     with read_errors(path, "give a .pcd or .ply file"):
         content = path.read_bytes()
     try:
-        columns, viewpoint = parse(content)
+        columns, T_world_sensor = parse(content)
         points = _triple(columns, "x y z")
         if points is None or any(columns[axis].dtype.kind != "f" for axis in "xyz"):
             raise ValueError("no floating-point fields x y z")
@@ -112,14 +123,14 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
         raise InputError(path, f"broken file or header: {reason}", "export the cloud again") from error
     normals = _triple(columns, "normal_x normal_y normal_z", "nx ny nz")
     labels = _labels(columns, label_divisor, path)
-    stored = StoredCloud(points, normals, labels, _colours(columns), viewpoint, path.name)
+    stored = StoredCloud(points, normals, labels, _colours(columns), T_world_sensor, path.name)
     if not stored.kept.any():
         raise InputError(path, "has no finite points", "give a cloud with readings")
     return stored
 
 
 def _parse_pcd(content: bytes) -> tuple[Columns, Array]:
-    """The fields and the viewpoint (3,). Errors are a ValueError, or an exception of pypcd4."""
+    """The fields and the pose of the sensor (4, 4). Errors are a ValueError, or an exception of pypcd4."""
     from pypcd4.pypcd4 import MetaData, PointCloud
 
     end = re.search(rb"^DATA\b[^\n]*\n", content[:65536], re.MULTILINE)
@@ -157,7 +168,9 @@ def _parse_pcd(content: bytes) -> tuple[Columns, Array]:
     data = np.atleast_1d(PointCloud.from_fileobj(file).pc_data)
     if len(data) != header.points:
         raise ValueError(f"POINTS {header.points}, but data of {len(data)} points follows")
-    return {name: data[name] for name in dtype.names or ()}, np.array(header.viewpoint[:3], dtype=np.float64)
+    *place, w, x, y, z = header.viewpoint
+    turn = Rotation.from_quat((x, y, z, w)).as_matrix() if any((w, x, y, z)) else np.eye(3)
+    return {name: data[name] for name in dtype.names or ()}, transforms.rigid(turn, place)
 
 
 def _tidy_header(lines: list[str]) -> list[str]:
@@ -179,7 +192,7 @@ def _tidy_header(lines: list[str]) -> list[str]:
 
 
 def _parse_ply(content: bytes) -> tuple[Columns, Array]:
-    """The fields, and the origin as the viewpoint; like `_parse_pcd`."""
+    """The fields, and the identity as the pose of the sensor; like `_parse_pcd`."""
     from trimesh.exchange.ply import _parse_header, load_ply
 
     file = io.BytesIO(content)
@@ -199,7 +212,7 @@ def _parse_ply(content: bytes) -> tuple[Columns, Array]:
     columns = {name.lower(): np.asarray(data[name]).reshape(len(data[name]), -1)[:, 0] for name in names}
     if any(len(column) != vertex["length"] for column in columns.values()):
         raise ValueError(f"fewer than {vertex['length']} points")
-    return columns, np.zeros(3)
+    return columns, np.eye(4)
 
 
 def _triple(columns: Columns, *choices: str) -> Array | None:

@@ -147,10 +147,13 @@ def observe(
     cloud, pixels = _points(source, config, known)
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     pose = source.T_world_camera if isinstance(source, View) else None
+    if pose is None and (eye := cloud.viewpoint_world) is not None:
+        # A single sensor looks at the middle of what it sees.
+        pose = transforms.look_at(eye, eye + transforms.unit(cloud.points_world - eye).mean(axis=0))
     notes: tuple[str, ...] = ()
     if given is not None:
         given, notes = _without_others(whole, cloud, given, known, UP, config, rng, pose)
-    surfaces = _find_surfaces(cloud, given, known, UP, config, rng, pose)
+    surfaces = find_surfaces(cloud, given, known, UP, config, rng, pose)
     if isinstance(source, View):
         # A level face no larger than an object and closed below is the top of an object.
         surfaces = tuple(
@@ -308,7 +311,7 @@ def level_transform(
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     if given is not None:
         given, _ = _without_others(source, cloud, given, (), None, config, rng, pose)
-    surface = _find_surfaces(cloud, given, (), None, config, rng, pose)[0]
+    surface = find_surfaces(cloud, given, (), None, config, rng, pose)[0]
     return transforms.level_world(surface.normal_world, surface.point_world)
 
 
@@ -334,12 +337,12 @@ def _without_others(
     apart = copy.deepcopy(rng)  # The same view without that label gives the same scene.
     if not known:
         with suppress(NoSurfaceError):
-            found = _find_surfaces(cloud, given, (), up, config, apart, T_world_camera)[0]
+            found = find_surfaces(cloud, given, (), up, config, apart, T_world_camera)[0]
             heights = found.height(cloud.points_world[given > 0])
             high = int(np.count_nonzero(heights > config.segmentation.max_height))
             shown = high < config.surface.min_points
         with suppress(NoSurfaceError):
-            surfaces = list(_find_surfaces(cloud, None, (), up, config, apart, T_world_camera))
+            surfaces = list(find_surfaces(cloud, None, (), up, config, apart, T_world_camera))
     reach, others = config.surface.tolerance, dict[int, str]()
     for k, surface in enumerate(surfaces):
         if not known and (k or shown) and surface.shape.extents.max() <= config.fit.max_extent:
@@ -357,7 +360,7 @@ def _without_others(
     return np.where(np.isin(given, [*others]), np.int32(0), given), tuple(others.values())
 
 
-def _find_surfaces(
+def find_surfaces(
     cloud: Cloud,
     given: NDArray[np.int32] | None,
     known: Sequence[SupportSurface],
@@ -366,7 +369,20 @@ def _find_surfaces(
     rng: np.random.Generator,
     T_world_camera: Array | None,
 ) -> tuple[SupportSurface, ...]:
-    """Find the support surfaces in points without a labelled object."""
+    """Find the support surfaces in points without a labelled object, as `find_support_surfaces` does.
+
+    Args:
+        cloud: The points, with normals.
+        given: Labels (N,) of the points, 0 = no object; None if there are none.
+        known: The surfaces known so far, the main one first.
+        up: Upward direction (3,), or None if the camera's pose is unknown.
+        config: All stages' settings.
+        rng: Draws the hypotheses.
+        T_world_camera: Reported camera pose (4, 4) in the frame of the points, or None.
+
+    Raises:
+        NoSurfaceError: No surface is known, and none is seen.
+    """
     loose = np.ones(len(cloud), dtype=bool) if given is None else given == 0
     if not known and not loose.any():
         raise NoSurfaceError(

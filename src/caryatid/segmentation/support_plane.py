@@ -526,10 +526,12 @@ def _choose_table(
         basis = _basis(plane.normal)
         flat = every @ basis.T
         seen = np.compress(plane.inliers, points, axis=0) @ basis.T
-        own = Region.around(seen, CELL).grown(config.gap / 2.0 if weights is None else 2.0 * CELL).holds(flat)
+        region = Region.around(seen, CELL)
+        region = region.filled() if weights is None else region
+        own = region.grown(2.0 * CELL).holds(flat)
         height = every @ plane.normal - plane.offset
         heights[k] = np.where(own & (height > -config.tolerance), height, np.inf)
-        below |= own & (height < -config.search)
+        below |= own & (height < -config.tolerance)
     least = heights.min(axis=0)
     if weights is None:
         weights = np.where((least > config.search) & ~below, 1.0, 0.01)
