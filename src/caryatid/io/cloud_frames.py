@@ -54,8 +54,8 @@ def level_cloud(
         reason = f"half its points are {size:,.0f} m or more from their middle"
         unit = "its unit seems to be millimetres or centimetres"
         raise InputError(stored.name, f"{reason}; {unit}", "save it in metres")
-    frames = [np.eye(4), transforms.invert(stored.T_world_sensor)]
-    frames = frames[: 1 if np.array_equal(*frames) else 2]
+    stated = transforms.invert(stored.T_world_sensor)
+    frames = [np.eye(4), *([] if np.array_equal(stated, np.eye(4)) else [stated])]
     shares = [hidden_share(transforms.transform(T, points)) for T in frames]
     tries: list[Array | None] = [frames[k] for k in np.argsort(shares, kind="stable") if shares[k] <= SEVERAL]
     if stored.normals is not None:

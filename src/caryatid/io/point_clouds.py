@@ -75,7 +75,7 @@ class StoredCloud:
 
         Args:
             config: How normals are estimated.
-            T_sensor_file: Transform (4, 4) to the frame of the sensor, which is the viewpoint. None = keep the
+            T_sensor_file: Transform (4, 4) to the frame of the sensor, its viewpoint. None = keep the
                 frame of the file; normals are estimated as if the sensor were at the origin.
         """
         kept, T = self.kept, np.eye(4) if T_sensor_file is None else T_sensor_file
