@@ -238,11 +238,6 @@ def without_depth(view):
     return replace(view, depth=np.where(view.labels == 1, np.float32(0.0), view.depth))
 
 
-def smoothed(view):
-    """Labels resized like a picture."""
-    return replace(view, labels=np.rint(ndimage.gaussian_filter(40.0 * view.labels, 1.5)).astype(np.int32))
-
-
 def cropped(view):
     """Only 20 cm of the table, in its middle."""
     far = np.abs(transforms.transform(view.pose, view.points_camera)[..., :2]).max(axis=-1) > 0.1
@@ -254,7 +249,6 @@ def cropped(view):
     [
         (lambda view: view, ""),
         (near, "10000 readings nearer than cloud.min_depth = 0.1 m are ignored"),
-        (smoothed, "labels are slivers, as if interpolated; resize them by nearest neighbours"),
         (without_depth, "too few depth readings in mask 1; its object is missed"),
         (cropped, "the support surface is only 0.19 m wide"),
         (

@@ -235,8 +235,8 @@ class Goal:
     def _is_client_there(self) -> bool:
         """Whether the client receives messages of the goal's status, which are repeated for this purpose.
 
-        DDS notices only after 20 s that a process was killed. If none was ever acknowledged, it waits for one
-        that was killed before this goal.
+        DDS notices only after 20 s that a process was killed, and until then, none of the messages counts as
+        acknowledged. So silence counts only after an acknowledgement during this goal.
         """
         now, watched = time.monotonic(), self._watched
         if now - self._beat < BEAT:

@@ -10,8 +10,8 @@ from caryatid.errors import InputError
 
 KEPT, KEPT_FOR_MASKS = 10, 60
 """Images that wait for a transform or for the other images, or for masks [1]: 0.3 s and 2 s at 30 Hz."""
-
-SAID = {"colour": "colour images", "masks": "masks"}
+NOUNS = {"colour": "colour images", "masks": "masks"}
+"""What messages call the images that are matched with depth."""
 
 
 def seconds_of(stamp: Any) -> float:
@@ -71,7 +71,7 @@ class Inbox:
                 yield depth, info, {w: known[w][gaps[w].index(min(gaps[w]))] for w in known}
         for what, gap in apart.items():
             if gap > slop:
-                reason = f"stamps of depth and {SAID[what]} differ by {gap:.3f} s or more"
+                reason = f"stamps of depth and {NOUNS[what]} differ by {gap:.3f} s or more"
                 raise InputError(topic, reason, f"synchronise them, or raise slop, which is {slop:g} s")
 
 

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import binary_erosion, maximum_filter, minimum_filter
+from scipy.ndimage import binary_erosion
 
 from caryatid.config import Config, SurfaceConfig
 from caryatid.errors import WrongViewError
@@ -22,8 +22,6 @@ AWAY = 100.0
 and a camera farther than 10 cm from the origin is beyond it in millimetres."""
 COARSER = 4
 """Edge of the cells in which views are compared [voxels]; wider than the point spacing of small images."""
-MANY = 20
-"""Number of labels of which most are slivers in interpolated images only [1]."""
 
 
 def check_camera(view: View, max_coordinate: float) -> None:
@@ -67,9 +65,7 @@ def check_range(view: View, config: Config) -> None:
 
 
 def check_masks(view: View, eye_world: Array | None, surface: SupportSurface, config: Config) -> None:
-    """Warn of interpolated labels, and of masks as large as an object with too few readings for a shape.
-
-    The latter are those of transparent objects.
+    """Warn of masks as large as an object with too few readings for a shape, as of transparent objects.
 
     Args:
         view: The view, with its masks.
@@ -79,14 +75,6 @@ def check_masks(view: View, eye_world: Array | None, surface: SupportSurface, co
     """
     assert view.labels is not None
     assert eye_world is not None
-    numbers = np.unique(view.labels).size - 1
-    if numbers >= MANY:
-        flat = maximum_filter(view.labels, 3) == minimum_filter(view.labels, 3)
-        if np.unique(view.labels[flat]).size - 1 < 0.2 * numbers:
-            remedy = "resize them by nearest neighbours, and give soft masks as a stack of scores (N, H, W)"
-            log.warning(
-                "%s: most of %d labels are slivers, as if interpolated; %s", view.name, numbers, remedy
-            )
     distance = np.linalg.norm(eye_world - surface.point_world)
     enough = config.segmentation.min_area / (distance / view.K[0, 0]) ** 2
     unread = np.bincount(view.labels[(view.depth <= 0.0) & (view.labels > 0)])
