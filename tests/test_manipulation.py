@@ -304,6 +304,24 @@ class TestGrasps:
             "1 of 4 objects can be removed; "
             "o3, o2, o1 cannot be grasped: no side fits between the fingers (80 mm)"
         )
+        below = plan_order(tower(), with_gripper(JAW), goal="o1")
+        assert below.refusal == "o1 cannot be grasped: no side fits between the fingers (80 mm)"
+
+    def test_an_order_says_that_what_lies_on_an_unsafe_lift_cannot_be_grasped(self):
+        table = graph_of(
+            box((0.0, 0.0, TOP + 0.15), (0.06, 0.06, 0.3)), box((0.0, 0.0, TOP + 0.32), (0.1, 0.1, 0.04))
+        )
+        order = plan_order(table, with_gripper(JAW))
+        assert [(s.object_id, s.safe) for s in order.steps] == [("o1", False)]
+        assert order.refusal == (
+            "no safe order: lifting o1 disturbs o2; "
+            "o2 cannot be grasped: no side fits between the fingers (80 mm)"
+        )
+
+    def test_a_map_of_the_camera_is_none_of_the_gripper(self):
+        reach = ReachabilityMap(np.full((8, 8, 8, 1), 255, np.uint8), -4.0 * np.ones(3), 1.0, 0.0, "camera")
+        with pytest.raises(InputError, match="is a map of the camera .* needed is one of the gripper"):
+            plan_order(tower(), with_gripper(JAW), reachable=reach)
 
 
 def in_physics(*shapes):

@@ -129,9 +129,10 @@ def start_node():
 
 
 @pytest.fixture(scope="module")
-def node(table):
+def node(table, client):
     """A node with default parameters, which the tests of a module share."""
     process = Process(*NODE, **TOPICS, image_timeout=2.0, move_timeout=5.0, robot="breaking:make")
+    wait_for(lambda: client.call("go_home").success, 20.0, "that the node hears the table")
     yield process
     process.stop()
 

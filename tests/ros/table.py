@@ -2,7 +2,8 @@
 
     python tests/ros/table.py --ros-args -p scene:=tower
 
-Its parameters may be changed while it runs. The camera moves to the newest `decision` (or stays).
+Its parameters may be changed while it runs. The camera moves to the newest `decision` (or stays). Its service
+`go_home` moves the camera to its first pose, and says whether another node is listening.
 """
 
 from __future__ import annotations
@@ -96,7 +97,8 @@ class Table(Node):
         self._way = time.monotonic(), self.pose, end
 
     def _go_home(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.pose, self._way, response.success = self._home, None, True
+        self.pose, self._way = self._home, None
+        response.success = min(t.get_subscription_count() for t in (self._tf_topic, self._info_topic)) > 0
         return response
 
     def _move(self) -> None:

@@ -18,6 +18,7 @@ from caryatid.benchmark.suites import SUITES, change_suite
 from caryatid.cli import NOT_SAFE
 from caryatid.cli.commands import Benchmark, Describe, Evaluate, Export, Import, Order, Report
 from caryatid.cli.output import kept, table
+from caryatid.config import Config
 from caryatid.errors import InputError, needs_extra
 from caryatid.evaluation.truths import evaluate_run
 from caryatid.exports import export_graph, format_of
@@ -93,12 +94,17 @@ def find_order(command: Order) -> int:
         )  # fmt: skip
     steps = order_table(order, brief=True)
     rows = [[entry.text for entry in row] for row in steps.rows]
-    jaw = f", opening {1e3 * config.gripper.opening:.0f} mm" if config.gripper.kind == "parallel" else ""
-    gripper = "" if config.gripper.kind == "none" else f" with a {config.gripper.kind} gripper{jaw}"
-    shown = table(f"Steps{gripper}", steps.columns, rows) if rows else ""
+    shown = table(f"Steps{describe_gripper(config)}", steps.columns, rows) if rows else ""
     refusal = f"{order.refusal}\n" if order.refusal else ""
     command.output.result(order.to_json(), f"{command.run}: {order_line(order)}\n", refusal, shown)
     return 0 if order.safe else NOT_SAFE
+
+
+def describe_gripper(config: Config) -> str:
+    """Name the gripper of the lifts and its opening; empty without one."""
+    gripper = config.gripper
+    jaw = f", opening {1e3 * gripper.opening:.0f} mm" if gripper.kind == "parallel" else ""
+    return "" if gripper.kind == "none" else f" with a {gripper.kind} gripper{jaw}"
 
 
 def redraw_report(command: Report) -> None:

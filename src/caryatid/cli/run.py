@@ -18,7 +18,7 @@ import numpy as np
 from caryatid.cli import NOT_SAFE
 from caryatid.cli.commands import VIEWER_PORT, Clear, Demo, Explore, Extract, View
 from caryatid.cli.output import Output, kept, profile, table
-from caryatid.cli.results import write_report
+from caryatid.cli.results import describe_gripper, write_report
 from caryatid.config import Config
 from caryatid.errors import GoalError, InputError
 from caryatid.evaluation.oracle import planner_for
@@ -153,7 +153,8 @@ def clear_table(command: Clear) -> int:
             for number, lift in enumerate(taken, start=1)
         ]  # fmt: skip
         outcome = f"{', '.join(harmed)} disturbed" if harmed else "nothing disturbed"
-        title = f"{source.name}: {last.stop}; {count_of(last.index + 1, 'view')}, {outcome}"
+        name = f"{source.name}{describe_gripper(config)}"
+        title = f"{name}: {last.stop}; {count_of(last.index + 1, 'view')}, {outcome}"
         output.result(document, table(title, ("", "remove", "body", "hold", "disturbed", "reason"), rows))
         return 0 if success else NOT_SAFE
 

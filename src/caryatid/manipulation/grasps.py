@@ -19,6 +19,7 @@ from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Grasp
 from caryatid.robots.arm import Reachable
+from caryatid.robots.reachability import ReachabilityMap
 from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 POINTS = 200
@@ -63,7 +64,12 @@ def find_grasp(
         voxels: What was seen empty; None = only known shapes obstruct.
         reachable: Which gripper poses (N, 4, 4), in the world frame, the arm reaches; None = all. The arm has
             to reach the grasp, the start of its approach, and the end of the lift.
+
+    Raises:
+        InputError: The map is not one of the gripper in the world frame.
     """
+    if isinstance(reachable, ReachabilityMap):
+        reachable.check_use("reachable", "gripper", "world")
     jaw = gripper.kind == "parallel"
     found = list(_antipodal(shape, gripper, friction) if jaw else _flat(shape, gripper))
     if not found:

@@ -136,10 +136,12 @@ def plan_order(
         wanted = _in_turn(rehearsal) if goal is None else _on_the_way(goal, rehearsal)
         trial, tried = _safest(rehearsal, wanted, hands)
         if trial is None:
-            refusal = refusal or _out_of_grasp(rehearsal, wanted, goal)
+            done = f"{len(found)} of {len(rehearsal.ids)} objects can be removed"
+            known = [done] if goal is None else []
+            refusal = refusal or "; ".join([*known, *_out_of_grasp(rehearsal, wanted)])
             break
         if trial.risk > rehearsal.accepted and not refusal:
-            refusal = _refusal(trial, tried)
+            refusal = "; ".join([_refusal(trial, tried), *_out_of_grasp(rehearsal, wanted)])
         found.append(_step(rehearsal, trial, left))
         rehearsal.take(trial)
     return Order(tuple(found), refusal, rehearsal.risk)
@@ -221,15 +223,13 @@ def _step(rehearsal: _Rehearsal, trial: _Trial, left: Sequence[str]) -> TakeStep
     return TakeStep(trial.object_id, trial.hold, safe, trial.risk, why, grasp)
 
 
-def _out_of_grasp(rehearsal: _Rehearsal, wanted: Sequence[str], goal: str | None) -> str:
-    """Say what can be removed, and why the gripper can grasp none of the others."""
+def _out_of_grasp(rehearsal: _Rehearsal, wanted: Sequence[str]) -> list[str]:
+    """Say which objects the gripper cannot grasp, and why, one sentence for each reason."""
     reasons: dict[str, list[str]] = {}
     for object_id in wanted:
         if isinstance(grasp := rehearsal.grasp(object_id), Blocked):
             reasons.setdefault(grasp.why, []).append(object_id)
-    done = len(rehearsal.ids) - len(rehearsal.left())
-    head = f"{goal} cannot be reached" if goal else f"{done} of {len(rehearsal.ids)} objects can be removed"
-    return "; ".join([head, *(f"{', '.join(ids)} cannot be grasped: {why}" for why, ids in reasons.items())])
+    return [f"{', '.join(ids)} cannot be grasped: {why}" for why, ids in reasons.items()]
 
 
 def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:

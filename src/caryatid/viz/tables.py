@@ -105,7 +105,7 @@ def point_table(decision: Decision | None) -> Table:
 def order_line(order: Order) -> str:
     """Say whether an order is safe, how probably all of it is, and what to remove."""
     if not order.steps:
-        return "no object can be removed"
+        return "no lift is possible"
     head, likely = "no safe order; the least risky one", f"{1.0 - order.risk:.0%}"
     if order.safe:
         head, likely = "safe order", f"whole order: {likely}"
