@@ -320,7 +320,7 @@ class TestGrasps:
 
     def test_a_map_of_the_camera_is_none_of_the_gripper(self):
         reach = ReachabilityMap(np.full((8, 8, 8, 1), 255, np.uint8), -4.0 * np.ones(3), 1.0, 0.0, "camera")
-        with pytest.raises(InputError, match="is a map of the camera .* needed is one of the gripper"):
+        with pytest.raises(InputError, match=r"is a map of the camera .* needed is one of the gripper"):
             plan_order(tower(), with_gripper(JAW), reachable=reach)
 
 

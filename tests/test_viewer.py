@@ -465,7 +465,7 @@ def wait_until(true, tab):
 
 @pytest.fixture
 def seen(opening, settings, browser):
-    """A page after one view, in Chromium; whatever a test does, no error is logged and nothing leaves this machine."""
+    """A page after one view, in Chromium; no test logs an error, and nothing leaves this machine."""
     page = LoopPage(opening, settings, segmentation="labels")
     page.turn()
     page.wait()
