@@ -10,7 +10,7 @@ import pytest
 from raycast import TABLE, from_the_side, table_scene
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
-from synthetic import TABLE_TOP, model_of, simulated_cloud, simulated_views
+from synthetic import TABLE_TOP, model_of, simulated_cloud, simulated_scene, simulated_views
 
 from caryatid.config import CloudConfig, Config
 from caryatid.errors import InputError, PerceptionError
@@ -123,6 +123,17 @@ def test_stray_readings_and_ramps_beside_an_edge_are_no_objects():
     share = np.minimum(beyond / 11.0, 1.0)
     mixed = 1.0 / ((1.0 - share) / view.depth[row, column] + share / view.depth)
     assert found(labels_of(replace(view, depth=mixed.astype(np.float32))), view.labels) == (1, 1, 1)
+
+
+def test_a_board_over_the_edge_stays_whole_where_a_weight_covers_the_rest():
+    """35 cm long, of which 14 cm are over the table; a crate on these leaves little of them to see."""
+    view = simulated_views("overhang-4-418", vga=True)[0]
+    (board,) = (k for k, body in simulated_scene("overhang-4-418").object_bodies.items() if body == "object0")
+    labels = labels_of(view)
+    own = view.labels == board
+    most = np.bincount(labels[own & (labels > 0)]).argmax()
+    assert (labels[own] == most).mean() > 0.8
+    assert (view.labels[labels == most] == board).mean() > 0.95
 
 
 @pytest.mark.parametrize(("elevation", "width"), [(55.0, 0.2), (85.0, 0.3)])

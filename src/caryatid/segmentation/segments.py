@@ -34,6 +34,8 @@ from caryatid.sensing.views import Cloud, View, depth_behind
 
 SMALLEST = 160
 """Minimum number of samples across an image for the network [1]: it was trained on crops of 192."""
+OVER = 0.2
+"""Minimum share of a part that is over the surface that it stands on [1]."""
 PLAIN = 0.02
 """How much the shares of red, green and blue differ on an object of one colour [1]."""
 
@@ -70,19 +72,22 @@ def segment(
         return labels, apart
     samples = take_samples(view, foreground, surface, config, clouds)
     points, normals = samples.points_camera, samples.normals_camera
+    up = surface.normal_world @ view.pose[:3, :3]
     edges, steps = grid_edges(samples.places, points, normals, config.edge_jump)
     odds = borders = None
     if view.depth.shape[1] >= SMALLEST * config.stride:
-        up, eye = surface.normal_world @ view.pose[:3, :3], view.pose[None, :3, 3]
+        eye = view.pose[None, :3, 3]
         odds = affinities(samples.depth, samples.rgb, samples.K, up, float(surface.height(eye)[0]))
         borders = partial(affinity_borders, samples, odds, config.alike)
     part = convex_parts(points, normals, edges, config, steps, borders)
     wide = wide_parts(samples.image(part))
     # Something beside the surface or in the room behind is not an object on it; nor is a wall at its edge,
-    # which begins where the readings of the surface end. Of a board that a weight holds, most may be outside.
+    # which begins where the readings of the surface end. Of a board that a weight holds, all may be outside.
     over = surface.pixels_over(view, 0.0, np.inf, -surface.core.size, core=True)[samples.grid][samples.places]
     proper = wide[part]
-    part = _with_share(np.where(proper, part, 0), over, 0.2)
+    part = np.where(proper, part, 0)
+    juts = find_jutting(samples, part, over, -config.margin * up, 2.0 * config.edge_jump)[part]
+    part = _with_share(part, over | juts, OVER)
     uncut, width = samples.image(part), GAP // config.stride
     if view.rgb is not None and samples.rgb is not None:
         least, seam = config.min_area / samples.spacing**2, find_seams(view.rgb, samples.grid)
@@ -93,10 +98,10 @@ def segment(
     low = surface.pixels_over(view, -config.clearance, config.clearance, config.margin)
     part, inside = merge_insides(samples, part, low[samples.grid], np.count_nonzero(low) / config.stride**2)
     if odds is not None:
-        part = _with_share(part, odds[-1][samples.places] > 0.0, 0.5)
+        part = _with_share(part, juts | (odds[-1][samples.places] > 0.0), 0.5)
     part = merge_occluded(samples, part, config, fit_config, rng)
     # Readings of the surface with a common error exceed the clearance, but not by twice as much.
-    part = _with_share(part, samples.height > 2.0 * config.clearance, 0.05)
+    part = _with_share(part, juts | (samples.height > 2.0 * config.clearance), 0.05)
     labels[samples.grid] = image = samples.image(part)
     if view.rgb is not None:
         apart = divided(image, uncut, facing, seam, width)
@@ -115,6 +120,41 @@ def segment(
     beyond &= (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
     _spread_labels(labels, np.flatnonzero(beyond), view.depth, jump, max(labels.shape))
     return labels, apart
+
+
+def find_jutting(samples: Samples, part: Labels, over: Mask, drop_camera: Array, jump: float) -> Mask:
+    """Find the parts 0 … n that jut out over the edge of a surface.
+
+    They continue one that is over the surface, and are open below. A wall, or something beside the surface,
+    goes on below; the edge of the surface hides the lower end of what is behind it.
+
+    Args:
+        samples: The samples.
+        part: Their parts (N,), 0 = none.
+        over: Which of them (N,) are over the surface.
+        drop_camera: How far below its lower end a part is open (3,) [m].
+        jump: Difference of 1/z between surfaces [1/m].
+    """
+    image, sizes = samples.image(part), np.maximum(np.bincount(part), 1)
+    beside = (np.bincount(part, over) / sizes < OVER) & (np.arange(len(sizes)) > 0)
+    if not beside.any():
+        return beside
+    inverse_depth = np.divide(1.0, samples.depth, out=np.zeros(image.shape), where=samples.depth > 0.0)
+    meeting = np.zeros(len(sizes), dtype=np.intp)
+    for here, there in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        for own, other in ((here, there), (there, here)):
+            near = np.abs(inverse_depth[own] - inverse_depth[other]) <= jump
+            meets = near & beside[image[own]] & (image[other] > 0) & ~beside[image[other]]
+            meeting += np.bincount(image[own][meets], minlength=len(sizes))
+    index = np.flatnonzero(beside[part])
+    below = samples.points_camera[index] + drop_camera
+    column, row = np.rint((below @ samples.K.T)[:, :2] / below[:, 2:]).astype(np.intp).T
+    inside = (row >= 0) & (row < image.shape[0]) & (column >= 0) & (column < image.shape[1])
+    index, below, place = index[inside], below[inside], (row[inside], column[inside])
+    lowest = image[place] != part[index]
+    opened = lowest & (1.0 / below[:, 2] - inverse_depth[place] > jump)
+    lower, free = (np.bincount(part[index], which, len(sizes)) for which in (lowest, opened))
+    return beside & (meeting >= MEETING) & (2.0 * free > lower)
 
 
 def _enlarged(image: NDArray[Any], stride: int, shape: tuple[int, ...]) -> NDArray[Any]:
