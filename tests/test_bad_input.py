@@ -110,7 +110,7 @@ def test_a_pose_of_another_convention_is_named(caplog, misread, says, azimuth):
 
 def test_a_first_pose_in_millimetres_is_refused(views):
     T = transforms.rigid(views[0].pose[:3, :3], 1000.0 * views[0].pose[:3, 3])
-    with refusal("as if in millimetres; give T_world_camera in metres"):
+    with refusal("as if in millimetres or centimetres; give T_world_camera"):
         model_of([views[0].with_pose(T)])
 
 

@@ -253,7 +253,7 @@ def cropped(view):
         (cropped, "the support surface is only 0.19 m wide"),
         (
             lambda view: replace(view, K=np.diag([2.0, 2.0, 1.0]) @ view.K, T_world_camera=None),
-            "is K for another resolution?",
+            "if K is for a resolution of 480×360, multiply its first two rows by 0.5",
         ),
     ],
 )

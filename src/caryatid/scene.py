@@ -26,18 +26,23 @@ from caryatid.graph import (
     label_of,
     object_id,
 )
-from caryatid.objects.changes import ChangeDetector, appeared, check_free
+from caryatid.objects.changes import ChangeDetector, appeared, describe_through
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed, without
 from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
 from caryatid.runtime import Pictured, call
 from caryatid.runtime.parallel import one_blas_thread
+from caryatid.segmentation.diagnosis import (
+    check_camera,
+    check_depth,
+    describe_centre,
+    explain_mismatch,
+    thin_view,
+)
 from caryatid.segmentation.holes import count_holes
 from caryatid.segmentation.observation import Observation, label_image, observe
 from caryatid.segmentation.support_plane import SupportSurface, find_surface_below, refitted
 from caryatid.segmentation.view_checks import (
-    check_camera,
-    check_centre,
     check_masks,
     check_place,
     check_range,
@@ -130,6 +135,7 @@ class Scene(Pictured):
         self._labelled: bool | None = None
         self._names: dict[str, dict[str, int]] = {}
         self._notes: frozenset[str] = frozenset()
+        self._first: View | None = None
 
     @property
     def surface(self) -> SupportSurface | None:
@@ -360,7 +366,10 @@ class Scene(Pictured):
         if isinstance(source, View):
             check_camera(source, self.config.cloud.max_coordinate)
             if not self.views and not self.waiting:
-                check_centre(source)
+                check_depth(source)
+                if off_centre := describe_centre(source):
+                    log.warning("%s: %s", source.name, off_centre)
+                self._first = None if source.T_world_camera is None else thin_view(source)
         else:
             labels = None if source.labels is None else check_labels(source.labels, source.name)
             source = replace(source, normals_world=transforms.unit(source.normals_world), labels=labels)
@@ -422,7 +431,9 @@ class Scene(Pictured):
             unexplained = observation.cloud.select(
                 np.isin(observation.labels, sorted(objects - new.keys() or objects))
             )
-            check_free(unexplained, self.surface, before, self.config)
+            if doubt := describe_through(unexplained, self.surface, before, self.config):
+                cause = self._cause_of_mismatch(observation.view)
+                log.warning("%s: %s; %s", source.name, doubt, cause or "its pose is wrong, or objects moved")
         if not named:
             observation, new = self._associate_segments(observation, given, new)
         if named and self.views:
@@ -535,9 +546,17 @@ class Scene(Pictured):
         observation = observation.moved(moves.pop(self.views))
         seen = self._models.points.of(SUPPORT_LABEL)
         if self.voxels and observation.view and len(seen.points_world) >= config.surface.min_points:
-            check_place(observation.cloud, registration.aligned, self.surfaces, self.voxels, config)
+            try:
+                check_place(observation.cloud, registration.aligned, self.surfaces, self.voxels, config)
+            except WrongViewError as error:
+                cause = self._cause_of_mismatch(observation.view)
+                raise WrongViewError(error.source, error.reason, cause or error.remedy) from None
         self._registration = registration
         return observation, {k for k in self._models.points.move(moves) if k <= MAX_LABEL}
+
+    def _cause_of_mismatch(self, view: View) -> str:
+        """Why a view's pose does not fit that of the first view, or ""."""
+        return "" if self._first is None else explain_mismatch(self._first, thin_view(view))
 
     def _fused_surfaces(self, observation: Observation) -> tuple[SupportSurface, ...]:
         """The support surfaces from the points of all views."""

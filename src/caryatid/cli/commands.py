@@ -190,6 +190,21 @@ class Import(options.Command, work="results:import_log"):
     """Maximum number of views."""
 
 
+class Check(options.Command, work="results:check_views"):
+    """Check the views of a recording: unit and kind of depth, camera, axes and unit of poses, clocks.
+
+    Say what each view shows and, in a line each, what is wrong and how to mend it. The exit status is 1 if
+    something is wrong.
+
+    Usage examples:
+      caryatid check recording/
+    """
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
+    """Recording: a folder in the BOP or TUM RGB-D format, or of a phone; import bags first."""
+    settings: options.Settings = options.Settings()
+
+
 class Evaluate(options.Command, work="results:print_scores"):
     """Score each view of a run: precision, recall and F1 of vertices and edges, mean IoU, probabilities.
 
@@ -496,8 +511,8 @@ class Completion(options.Command, work="commands:print_completion"):
 COMMANDS: dict[str, type[options.Command | Session]] = {
     command.__name__.lower(): command
     for command in (
-        Demo, Explore, Extract, View, Evaluate, Order, Clear, Import, Report, Describe, Export, Benchmark,
-        Session, Serve, Scenes, Config, Completion,
+        Demo, Check, Explore, Extract, View, Evaluate, Order, Clear, Import, Report, Describe, Export,
+        Benchmark, Session, Serve, Scenes, Config, Completion,
     )
 }  # fmt: skip
 """The commands in the order of the help."""

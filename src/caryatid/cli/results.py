@@ -16,22 +16,46 @@ from caryatid.benchmark.running import run_locally, run_on_cluster
 from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES, change_suite
 from caryatid.cli import NOT_SAFE
-from caryatid.cli.commands import Benchmark, Describe, Evaluate, Export, Import, Order, Report
+from caryatid.cli.commands import Benchmark, Check, Describe, Evaluate, Export, Import, Order, Report
 from caryatid.cli.output import kept, table
 from caryatid.config import Config
 from caryatid.errors import InputError, needs_extra
 from caryatid.evaluation.truths import evaluate_run
 from caryatid.exports import export_graph, format_of
-from caryatid.io.datasets import OpenOptions
+from caryatid.io.datasets import OpenOptions, open_dataset
 from caryatid.io.importing import import_recording, reasons
 from caryatid.io.staging import write_file
 from caryatid.manipulation.order import plan_order
 from caryatid.runtime import fingerprint
 from caryatid.runtime.parallel import cores
+from caryatid.segmentation.diagnosis import diagnose
 from caryatid.sources import open_run, read_model
 from caryatid.steps import read_config, read_steps
 from caryatid.viz.report import make_report, print_pdf, read_lift, render_html
-from caryatid.viz.tables import census, describe, order_line, order_table
+from caryatid.viz.tables import census, count_of, describe, order_line, order_table
+
+
+def check_views(command: Check) -> int:
+    config, source = command.settings.read(), command.source
+    dataset = open_dataset(source, config.recording)
+    with command.output.working("looking"):
+        found = diagnose(dataset, config.cloud.max_coordinate)
+    columns = {
+        "view": "view", "size": "size\n[px]", "field_of_view": "width\n[°]", "readings": "readings",
+        "near": "near\n[m]", "far": "far\n[m]", "plane": "largest\nplane", "tilt": "tilt\n[°]",
+    }  # fmt: skip
+    rows = []
+    for view in found.views:
+        tilt = "–" if view["tilt"] is None else f"{view['tilt']:.1f}"
+        rows.append([
+            view["view"].rpartition("/")[2], f"{view['width']}×{view['height']}",
+            f"{view['field_of_view']:.0f}", f"{view['readings']:.0%}", f"{view['near']:.2f}",
+            f"{view['far']:.2f}", f"{view['plane']:.0%}", tilt,
+        ])  # fmt: skip
+    said = "".join(f"wrong: {problem}\n" for problem in found.problems) or "nothing is wrong\n"
+    shown = table(f"{source}: {count_of(len(rows), 'view')}", [*columns.values()], rows, figures=True)
+    command.output.result({"views": found.views, "problems": found.problems}, shown, said)
+    return 1 if found.problems else 0
 
 
 def import_log(command: Import) -> None:
@@ -61,6 +85,8 @@ def import_log(command: Import) -> None:
         output.say(note)
     skipped = f"; skipped: {reasons(imported.skipped)}" if imported.skipped else ""
     output.say(f"{source.name}: {len(imported)} views of {read} frames{skipped}")
+    for problem in diagnose(imported, config.cloud.max_coordinate).problems:
+        output.say(f"wrong: {problem}")
     output.say(f"recording: {out}; next, run `caryatid extract {out} --out run`")
 
 

@@ -16,6 +16,10 @@ NoiseModel = Literal["none", "carmine"]
 """Noise of the simulated camera."""
 ShapeKind = Literal["box", "cylinder", "sphere"]
 """The primitives."""
+CameraAxes = Literal["optical", "opengl", "body"]
+"""Conventions of the axes of a camera frame."""
+DepthKind = Literal["axis", "ray"]
+"""What readings of depth are."""
 GripperKind = Literal["none", "parallel", "suction"]
 """Grippers; with none, every object can be grasped."""
 ExportFormat = Literal[

@@ -12,7 +12,14 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 
-from caryatid.config.choices import FusionMethod, GripperKind, MaskIdentity, ShapeKind
+from caryatid.config.choices import (
+    CameraAxes,
+    DepthKind,
+    FusionMethod,
+    GripperKind,
+    MaskIdentity,
+    ShapeKind,
+)
 
 CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
@@ -583,6 +590,11 @@ class RecordingConfig:
     """Minimum share of pixels with a depth reading [1]; a camera too close to a surface has fewer."""
     far: Annotated[float, Field(gt=0, le=65)] = 10.0
     """Readings beyond this depth are dropped [m]; beyond the range of RGB-D cameras."""
+    axes: CameraAxes = "optical"
+    """Axes of the camera frame in the poses: optical (x right, y down, z forward), opengl (y up, z backward)
+    or body (x forward, y left, z up)."""
+    depth: DepthKind = "axis"
+    """Whether depth is along the optical axis, or the distance along the ray of each pixel."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from caryatid.config import RecordingConfig
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
+from caryatid.segmentation.diagnosis import BODY, GL, ray_lengths
 from caryatid.sensing.views import View
 
 BUILT_IN: Final = ("phones", "bop", "tum", "bags")
@@ -195,4 +196,22 @@ def open_dataset(
         phones = "a recording of nerfstudio, Record3D or Stray Scanner"
         remedy = f"give a BOP scene folder, {bags}, a TUM RGB-D folder with depth.txt, or {phones}"
         raise InputError(path, "unknown format" if path.exists() else "no such file or folder", remedy)
-    return known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())
+    config = config or RecordingConfig()
+    dataset = known.open_dataset(path, config, options or OpenOptions())
+    if (config.axes, config.depth) == ("optical", "axis"):
+        return dataset
+    return replace(dataset, frames=[_converted(frame, config) for frame in dataset.frames])
+
+
+def _converted(frame: Frame, config: RecordingConfig) -> Frame:
+    """A frame whose camera axes and depth are ours, from one of another convention."""
+    axes = {"optical": np.eye(4), "opengl": GL, "body": BODY}[config.axes]
+    T = None if frame.T_world_camera is None else frame.T_world_camera @ axes
+
+    def load() -> View:
+        view = frame.load()
+        if config.depth == "ray":
+            view = replace(view, depth=(view.depth / ray_lengths(view)).astype(np.float32))
+        return replace(view, T_world_camera=T)
+
+    return replace(frame, load=load, T_world_camera=T)

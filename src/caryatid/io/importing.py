@@ -22,8 +22,8 @@ from caryatid.io.datasets import NO_COLOUR, NO_POSE, Dataset, Frame, OpenOptions
 from caryatid.io.images import BrokenImageError
 from caryatid.io.staging import StagedFolder
 from caryatid.io.video import SECOND
+from caryatid.segmentation.diagnosis import GL_AXES
 from caryatid.segmentation.observation import level_transform
-from caryatid.segmentation.support_plane import GL_AXES
 from caryatid.sensing.views import View
 
 BROKEN: Final = "broken"

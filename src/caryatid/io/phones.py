@@ -29,12 +29,9 @@ from caryatid.io.images import BrokenImageError
 from caryatid.io.json_files import Numbers, parse_json, read_json
 from caryatid.io.staging import read_errors
 from caryatid.io.video import SECOND, is_pose
+from caryatid.segmentation.diagnosis import GL, Y_UP
 from caryatid.sensing.views import View, check_intrinsics
 
-AXES: Final = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Axes of an optical frame in those of OpenGL, whose camera looks along −z with y up."""
-Z_UP: Final = transforms.rigid([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], np.zeros(3))
-"""Pose of ARKit's world, whose y points up, in a world whose z does."""
 COLUMNS: Final = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 """Columns of odometry.csv that are read."""
 PINHOLES: Final = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
@@ -163,7 +160,7 @@ def _read_nerfstudio(path: Path, max_pixels: int) -> Iterator[_Shot]:
         yield _Shot(
             number,
             float(number),
-            known.transform_matrix @ AXES,
+            known.transform_matrix @ GL,
             check_intrinsics(K, where),
             (int(known.w), int(known.h)),
             partial(images.read_depth, path / known.depth_file_path, unit, max_pixels),
@@ -203,7 +200,7 @@ def _read_record3d(path: Path, max_pixels: int) -> Iterator[_Shot]:
         yield _Shot(
             number,
             number / known.fps,
-            Z_UP @ _pose([*pose[4:], *pose[:4]], f"{table}: pose {number}") @ AXES,
+            Y_UP @ _pose([*pose[4:], *pose[:4]], f"{table}: pose {number}") @ GL,
             K,
             (known.w, known.h),
             partial(read_depth, path / f"rgbd/{number}.depth"),
@@ -236,7 +233,7 @@ def _read_stray(path: Path, max_pixels: int) -> Iterator[_Shot]:
         yield _Shot(
             int(number),
             time,
-            Z_UP @ _pose(pose, f"{table}: frame {number:.0f}"),
+            Y_UP @ _pose(pose, f"{table}: frame {number:.0f}"),
             K,
             video.size,
             partial(read_depth, int(number)),

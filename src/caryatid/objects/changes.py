@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import logging
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -18,8 +17,6 @@ from caryatid.objects.fusion import extents_ratio
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
 from caryatid.sensing.voxel_map import FREE, OCCUPIED, VoxelMap
-
-log = logging.getLogger(__name__)
 
 DEPTH_MARGIN = 0.02
 """Distance behind a point at which a reading contradicts it [m], at 1.5 m and growing with z²: 2σ of pose
@@ -158,8 +155,10 @@ def appeared(
     return new
 
 
-def check_free(cloud: Cloud, surface: SupportSurface, voxels: VoxelMap, config: Config) -> None:
-    """Warn if earlier views looked through what a view shows above the table, and into what is behind.
+def describe_through(cloud: Cloud, surface: SupportSurface, voxels: VoxelMap, config: Config) -> str:
+    """Say how much of what a view shows above the table earlier views looked through; "" if too little.
+
+    They looked through it and into what is behind.
 
     Args:
         cloud: Points of the view that no change explains.
@@ -174,12 +173,9 @@ def check_free(cloud: Cloud, surface: SupportSurface, voxels: VoxelMap, config: 
     free = [voxels.state_at(points + step * inward) == FREE for step in range(BEHIND + 1)]
     through = np.all(free, axis=0)
     there, other = distinct(points[through]), distinct(points[~through])
-    if likelihood_ratio(there, other) > PRIOR_ODDS:
-        log.warning(
-            "%s: %.0f%% of its points above the table are in space that earlier views saw as free; its pose "
-            "is wrong, or objects were moved",
-            cloud.name, 100.0 * through.mean(),
-        )  # fmt: skip
+    if likelihood_ratio(there, other) <= PRIOR_ODDS:
+        return ""
+    return f"{through.mean():.0%} of its points above the table are in space that earlier views saw as free"
 
 
 class Sight:

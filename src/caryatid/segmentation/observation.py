@@ -14,6 +14,7 @@ from caryatid.config import CloudConfig, Config, SegmentationMethod
 from caryatid.errors import InputError, NoSurfaceError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import UP, Array
+from caryatid.segmentation.diagnosis import describe_unit, name_causes
 from caryatid.segmentation.foreground import find_bodies, find_foreground, find_furniture
 from caryatid.segmentation.samples import Labels
 from caryatid.segmentation.seams import Pairs
@@ -153,7 +154,12 @@ def observe(
     notes: tuple[str, ...] = ()
     if given is not None:
         given, notes = _without_others(whole, cloud, given, known, UP, config, rng, pose)
-    surfaces = find_surfaces(cloud, given, known, UP, config, rng, pose)
+    try:
+        surfaces = find_surfaces(cloud, given, known, UP, config, rng, pose)
+    except NoSurfaceError as error:
+        causes = name_causes(whole) if isinstance(whole, View) else []
+        tilted = f" or, if that plane is the table, {' or '.join(causes)}" if causes else ""
+        raise NoSurfaceError(f"{error}{tilted}") from None
     if isinstance(source, View):
         # A level face no larger than an object and closed below is the top of an object.
         surfaces = tuple(
@@ -170,6 +176,7 @@ def observe(
     elif isinstance(source, View):
         image, apart = segment_view(source, surfaces, config, rng)
         labels = image.ravel()[pixels]
+        apart = apart[np.isin(apart, labels).all(axis=1)]
     else:
         labels = segment_cloud(cloud, surfaces[0], config.segmentation)
     reach = config.surface.tolerance
@@ -287,7 +294,8 @@ def _why_nothing(view: View, config: CloudConfig) -> str:
         f"{end:.0f}" if end >= 100.0 else f"{end:.3g}" for end in (readings.min(), readings.max())
     )
     remedy = "check the unit of depth, or set cloud.min_depth and cloud.max_depth"
-    return f"all depth readings are at {'–'.join(ends)} m, none within {near:g}–{far:g} m; {remedy}"
+    where = f"{'–'.join(ends)} m, none within {near:g}–{far:g} m{describe_unit(readings)}"
+    return f"all depth readings are at {where}; {remedy}"
 
 
 def level_transform(

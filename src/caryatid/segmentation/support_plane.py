@@ -42,22 +42,6 @@ WIDEST = 200
 MIDDLE = 5.0
 """Angle from the optical axis at which what an image shows counts 0.6 of what its middle does [deg]: a fifth
 of the way to its border."""
-GL = np.diag([1.0, -1.0, -1.0])
-"""Axes (3, 3) of OpenCV's camera frame in OpenGL's."""
-BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Axes (3, 3) of OpenCV's camera frame, the optical one, in the frame of a camera's body."""
-GL_AXES = (
-    "the camera axes are OpenGL's (y up, z backward) instead of OpenCV's (y down, z forward): give "
-    "T_world_camera @ np.diag([1, -1, -1, 1])"
-)
-"""A cause of a wrong camera pose, and its remedy."""
-BODY_AXES = (
-    "the pose is that of the camera's body (x forward, z up) instead of its optical frame (x right, y down, "
-    "z forward): give the pose of the optical frame"
-)
-"""A cause of a wrong camera pose, and its remedy."""
-Z_UP = "rotate the world so that its z axis points up (on the command line: --level)"
-"""Remedy for a world frame that is not level."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -424,7 +408,7 @@ def find_support_surfaces(
         elif plane := _Scene(points * turned, normals * turned, None, config).largest_plane(everywhere, rng):
             up = plane.normal * turned
     if up is None:
-        raise NoSurfaceError(f"no support surface: {_tried(scene, rng, T_world_camera)}")
+        raise NoSurfaceError(f"no support surface: {_tried(scene, rng)}")
     up = transforms.unit(up)
     scene, left = scene._replace(up=up), normals @ up > np.cos(np.radians(config.max_deviation))
     surfaces = list[SupportSurface]()
@@ -440,7 +424,7 @@ def find_support_surfaces(
         planes.append(plane)
         left = left & (np.abs(points @ plane.normal - plane.offset) > 2.0 * config.tolerance)
     if not known and not planes:
-        raise NoSurfaceError(f"no support surface: {_tried(scene, rng, T_world_camera)}")
+        raise NoSurfaceError(f"no support surface: {_tried(scene, rng)}")
     if not known:
         weights, every = None, points if objects is None else np.concatenate([points, objects])
         if T_world_camera is not None:
@@ -469,7 +453,7 @@ def _some(which: Mask, count: int) -> Mask:
     return some
 
 
-def _tried(scene: _Scene, rng: np.random.Generator, T_world_camera: Array | None) -> str:
+def _tried(scene: _Scene, rng: np.random.Generator) -> str:
     """Say why no support surface was found, and what may help."""
     points, normals, up, config = scene
     if len(points) < config.min_points:
@@ -482,25 +466,7 @@ def _tried(scene: _Scene, rng: np.random.Generator, T_world_camera: Array | None
     if up is None or plane is None:
         return f"{tried}; show the table top"
     share, tilt = plane.inliers.mean(), np.degrees(transforms.angle_between(plane.normal, up))
-    tried += f"; the largest plane, {share:.0%} of them, is tilted by {tilt:.0f}°"
-    causes = [] if T_world_camera is None else _misread(T_world_camera, plane.normal, config)
-    return f"{tried}; show the table top or, if that plane is the table, {' or '.join(causes) or Z_UP}"
-
-
-def _misread(T_world_camera: Array, normal_world: Array, config: SurfaceConfig) -> list[str]:
-    """Conventions of a camera pose (4, 4) other than ours in which a plane's normal (3,) points up."""
-    R = T_world_camera[:3, :3]
-    normal_camera = R.T @ normal_world
-    y_up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    readings = {
-        GL_AXES: R @ GL,
-        BODY_AXES: R @ BODY,
-        "T_world_camera is the inverse, world to camera: invert it": R.T,
-        f"the world's y axis points up: {Z_UP}": y_up @ R,
-        f"{GL_AXES}, and the world's y axis points up: {Z_UP}": y_up @ R @ GL,
-    }
-    upright = np.cos(np.radians(config.max_tilt))
-    return [cause for cause, turn in readings.items() if (turn @ normal_camera)[2] > upright]
+    return f"{tried}; the largest plane, {share:.0%} of them, is tilted by {tilt:.0f}°; show the table top"
 
 
 def refitted(

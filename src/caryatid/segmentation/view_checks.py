@@ -17,43 +17,8 @@ from caryatid.sensing.voxel_map import VoxelMap
 
 log = logging.getLogger(__name__)
 
-AWAY = 100.0
-"""Distance of a camera from the world's origin beyond which its pose is not in metres [m]: no room is larger,
-and a camera farther than 10 cm from the origin is beyond it in millimetres."""
 COARSER = 4
 """Edge of the cells in which views are compared [voxels]; wider than the point spacing of small images."""
-
-
-def check_camera(view: View, max_coordinate: float) -> None:
-    """Reject a view with an implausible camera or pose, or with depth above a maximum [m].
-
-    Raises:
-        WrongViewError: The camera is implausible, or pose or depth are not in metres.
-    """
-    height, width = view.depth.shape
-    (fx, _, cx), (_, fy, cy) = view.K[:2]
-    pinhole = np.allclose(view.K, [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], atol=1e-3 * fx)
-    # Focal lengths of 0.05 and 50 image widths are 168° and 1° of view.
-    wide = min(fx, fy) >= 0.05 * width and max(fx, fy) <= 50.0 * width
-    if not (pinhole and wide and -width <= cx <= 2 * width and -height <= cy <= 2 * height):
-        remedy = "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of this image"
-        raise WrongViewError(view.name, f"K is implausible for a camera with {described(view)}", remedy)
-    far = 0.0 if view.T_world_camera is None else float(np.linalg.norm(view.T_world_camera[:3, 3]))
-    if far > AWAY:
-        reason = f"the camera is {far:.4g} m from the world's origin, as if in millimetres"
-        remedy = f"give T_world_camera in metres, in a world whose origin is within {AWAY:g} m"
-        raise WrongViewError(view.name, reason, remedy)
-    if float(view.depth.max(initial=0.0)) > max_coordinate:
-        reason = f"depth reaches {view.depth.max():.4g} m"
-        raise WrongViewError(view.name, f"{reason}, as if in millimetres", "give depth in metres")
-
-
-def check_centre(view: View) -> None:
-    """Warn if the principal point is a fifth of the image away from its middle, as for another resolution."""
-    size, centre = np.array(view.depth.shape[::-1]), view.K[:2, 2]
-    if (np.abs(centre - (size - 1) / 2.0) > size / 5.0).any():
-        text = "%s: K has its principal point at (%.0f, %.0f) in %d×%d pixels; is K for another resolution?"
-        log.warning(text, view.name, *centre, *size)
 
 
 def check_range(view: View, config: Config) -> None:
@@ -132,11 +97,3 @@ def check_place(
     common = float(seen[tuple(voxel[within].T // COARSER)].mean())
     if not aligned and common < config.registration.common:
         raise refused(f"only {common:.0%} of its points lie on surfaces of earlier views")
-
-
-def described(view: View) -> str:
-    """Image size, focal lengths and principal point of a view's camera."""
-    height, width = view.depth.shape
-    (fx, _, cx), (_, fy, cy) = view.K[:2]
-    camera = f"focal lengths {fx:.4g}, {fy:.4g} and principal point {cx:.4g}, {cy:.4g} px"
-    return f"{width}×{height} pixels, {camera}"

@@ -47,7 +47,7 @@ from caryatid.robots.floor import STEP, FloorGrid
 from caryatid.robots.protocol import straight_lengths
 from caryatid.runtime import fingerprint
 from caryatid.scene import KEPT, Scene
-from caryatid.segmentation.view_checks import described
+from caryatid.segmentation.diagnosis import describe_camera
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import View
 from caryatid.sessions.messages import Added, Capture, NextView
@@ -475,7 +475,8 @@ class Session:
             return
         same_size = view.depth.shape == first.depth.shape
         if not same_size or not np.allclose(view.K, first.K, atol=1e-3 * float(first.K[0, 0])):
-            reason = f"its camera has {described(view)}, but that of earlier views has {described(first)}"
+            one, other = describe_camera(view), describe_camera(first)
+            reason = f"its camera has {one}, but that of earlier views has {other}"
             raise InputError(view.name, reason, "use the same camera, or create a new session")
 
     def _file(self, event: Event) -> Path:

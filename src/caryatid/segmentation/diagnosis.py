@@ -1,0 +1,458 @@
+"""What the numbers of views mean: unit and kind of depth, camera, and convention of poses.
+
+A table is a level plane. If the readings, the camera or the pose are of another kind than ours, it is bent or
+tilted; the one kind that would make it flat and level is then named. Planes are found in the image: on one,
+the inverse of depth is an affine function of the pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from caryatid.errors import WrongViewError
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import UP, Array
+from caryatid.sensing.views import View
+
+AWAY = 100.0
+"""Distance of a camera from the world's origin beyond which its pose is not in metres [m]: no room is larger,
+and a camera farther than 10 cm from the origin is beyond it in millimetres."""
+SAMPLES, TRIALS = 1500, 200
+"""Numbers of pixels at which planes are looked for, and of triples that are tried [1]: 200 find a plane of a
+quarter of the pixels with confidence 0.96."""
+PLANES = 3
+"""Maximum number of planes of a view, largest first, of which one may be the table [1]."""
+FLAT = 0.005
+"""Deviation of a reading from a plane, relative to the reading [1]: noise of depth cameras up to 3 m."""
+LARGE = 0.2
+"""Minimum share of the readings on a plane that says of what kind they are [1]."""
+BETTER = 1.5
+"""How many times more readings another kind of depth must put on one plane [1]: a wrong kind puts at most
+1.0 times as many there as the right one in 63 real images; turned into another, 55 of them show more."""
+LEVEL = 10.0
+"""Maximum tilt of a plane that counts as level [deg]; as `surface.max_tilt`."""
+BUFFER = 0.8
+"""What nearly all values of a depth buffer exceed, if its near plane is at up to a fifth of the depth [1]."""
+OFF_CENTRE = 0.2
+"""How far the principal point may be from the image's middle [image widths and heights]."""
+OVERLAP = 0.3
+"""Minimum share of points above the table that another view shows too, if poses are as supposed [1]."""
+ODDS = 2.5
+"""How many times the odds of that share must be those with the poses as declared [1]."""
+NEAR = 0.015
+"""Distance of the same point in two views [m]; poses are off by about 1 cm."""
+LEAST = 20
+"""Minimum number of points above the table for that [1]."""
+
+GL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Axes (4, 4) of OpenCV's camera frame, the optical one, in OpenGL's."""
+BODY = transforms.rigid([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], np.zeros(3))
+"""The same axes in the frame of a camera's body."""
+Y_UP = transforms.rigid([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], np.zeros(3))
+"""Pose (4, 4) of a world whose y axis points up, such as ARKit's, in one whose z axis does."""
+Z_UP = "rotate the world so that its z axis points up (on the command line: --level)"
+"""Remedy for a world frame that is not level."""
+EARLY = "each pose is that of the view before: check the clocks of camera and poses"
+LATE = "each pose is that of the view after: check the clocks of camera and poses"
+OTHER_CAMERA = "K is for another resolution: multiply its first two rows by the ratio of the image sizes"
+"""A cause of wrong lengths, and its remedy."""
+GL_AXES = (
+    "the camera axes are OpenGL's (y up, z backward) instead of OpenCV's (y down, z forward): give "
+    "T_world_camera @ np.diag([1, -1, -1, 1]), or for a recording --set recording.axes=opengl"
+)
+"""A cause of a wrong camera pose, and its remedy."""
+BODY_AXES = (
+    "the pose is that of the camera's body (x forward, z up) instead of its optical frame (x right, y down, "
+    "z forward): give the pose of the optical frame, or for a recording --set recording.axes=body"
+)
+"""A cause of a wrong camera pose, and its remedy."""
+
+
+def _rolled(T: Array, by: int) -> Array:
+    quaternion = np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), by)
+    return transforms.rigid(Rotation.from_quat(quaternion).as_matrix(), T[:3, 3])
+
+
+def _turned(T: Array, angle: float) -> Array:
+    turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+    return transforms.rigid(T[:3, :3] @ turn, T[:3, 3])
+
+
+def _scaled(T: Array, factor: float) -> Array:
+    return transforms.rigid(T[:3, :3], factor * T[:3, 3])
+
+
+POSES: Mapping[str, Callable[[Array], Array]] = {
+    GL_AXES: lambda T: T @ GL,
+    BODY_AXES: lambda T: T @ BODY,
+    "T_world_camera is the inverse, world to camera: invert it": transforms.invert,
+    f"the world's y axis points up: {Z_UP}": lambda T: Y_UP @ T,
+    f"{GL_AXES}, and the world's y axis points up: {Z_UP}": lambda T: Y_UP @ T @ GL,
+    f"the world's z axis points down: {Z_UP}": lambda T: GL @ T,
+    "the quaternion of the pose begins with w, but was read as x y z w: reorder it": partial(_rolled, by=-1),
+    "the quaternion of the pose ends with w, but was read as w x y z: reorder it": partial(_rolled, by=1),
+    **{
+        f"the image is turned by {angle}° against its pose: turn image and K back": partial(
+            _turned, angle=angle
+        )
+        for angle in (90, 180, -90)
+    },
+}
+"""Conventions of poses (4, 4) other than ours, with their remedy, and how to read such a pose."""
+UNITS: Mapping[str, Callable[[Array], Array]] = {
+    f"depth is in metres, and the translation of T_world_camera in {unit}: give both in metres": partial(
+        _scaled, factor=factor
+    )
+    for unit, factor in {
+        "kilometres": 1e3,
+        "decimetres": 0.1,
+        "centimetres": 0.01,
+        "millimetres": 0.001,
+    }.items()
+}
+"""Units of poses other than that of depth, and how to read such a pose."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ImagePlane:
+    """The largest plane of an image.
+
+    Attributes:
+        affine: Coefficients (3,) of its inverse depth at pixels (u, v, 1) [1/m].
+        share: Share of the readings that lie on it [1].
+    """
+
+    affine: Array
+    share: float
+
+    def normal_camera(self, K: Array) -> Array:
+        """Its unit normal (3,) towards the camera, if the pinhole matrix is K (3, 3) [px]."""
+        return -transforms.unit(self.affine @ K)
+
+
+def find_image_plane(view: View, kind: str = "axis") -> ImagePlane:
+    """Find the largest plane of a view, if its readings are of a kind.
+
+    Args:
+        view: The view.
+        kind: `axis` for depth along the optical axis, `ray` for distance along the ray of each pixel,
+            `inverse` for inverse depth.
+    """
+    rng, index = np.random.default_rng(0), np.flatnonzero(view.valid)
+    if len(index) < 3:
+        return ImagePlane(np.array([0.0, 0.0, 1.0]), 0.0)
+    index = index[np.linspace(0, len(index) - 1, min(SAMPLES, len(index))).astype(np.intp)]
+    v, u = np.divmod(index, view.depth.shape[1])
+    pixels, w = np.stack([u, v, np.ones(len(u))]), view.depth.ravel()[index].astype(np.float64)
+    q = w if kind == "inverse" else 1.0 / w
+    if kind == "ray":
+        q = q * ray_lengths(view).ravel()[index]
+    triples = rng.integers(0, len(q), (TRIALS, 3))
+    corners = pixels.T[triples]
+    proper = np.abs(np.linalg.det(corners)) > 1.0
+    if not proper.any():
+        return ImagePlane(np.array([0.0, 0.0, 1.0]), 0.0)
+    planes = np.linalg.solve(corners[proper], q[triples[proper]][..., None])[..., 0]
+    near = np.abs(planes @ pixels - q) < FLAT * q
+    best = int(np.argmax(np.count_nonzero(near, axis=1)))
+    on, plane = near[best], planes[best]
+    for _ in range(2):
+        plane = np.linalg.lstsq(pixels[:, on].T, q[on], rcond=None)[0]
+        refined = np.abs(plane @ pixels - q) < FLAT * q
+        on = refined if np.count_nonzero(refined) > 3 else on
+    return ImagePlane(plane, float(on.mean()))
+
+
+def ray_lengths(view: View) -> Array:
+    """Length (H, W) of each pixel's ray up to depth 1: distance along the ray / depth along the axis [1]."""
+    x, y = ((np.arange(n) - view.K[k, 2]) / view.K[k, k] for k, n in enumerate(view.depth.shape[::-1]))
+    return np.asarray(np.sqrt(1.0 + x**2 + y[:, None] ** 2), dtype=np.float64)
+
+
+def check_camera(view: View, max_coordinate: float) -> None:
+    """Reject a view with an implausible camera or pose, or with depth above a maximum [m].
+
+    Raises:
+        WrongViewError: The camera is implausible, or pose or depth are not in metres.
+    """
+    height, width = view.depth.shape
+    (fx, _, cx), (_, fy, cy) = view.K[:2]
+    pinhole = np.allclose(view.K, [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], atol=1e-3 * fx)
+    # Focal lengths of 0.05 and 50 image widths are 168° and 1° of view.
+    wide = min(fx, fy) >= 0.05 * width and max(fx, fy) <= 50.0 * width
+    if not (pinhole and wide and -width <= cx <= 2 * width and -height <= cy <= 2 * height):
+        remedy = "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of this image"
+        raise WrongViewError(view.name, f"K is implausible for a camera with {describe_camera(view)}", remedy)
+    far = 0.0 if view.T_world_camera is None else float(np.linalg.norm(view.T_world_camera[:3, 3]))
+    if far > AWAY:
+        reason = f"the camera is {far:.4g} m from the world's origin, as if in millimetres or centimetres"
+        remedy = f"give T_world_camera in metres, in a world whose origin is within {AWAY:g} m"
+        raise WrongViewError(view.name, reason, remedy)
+    if float(view.depth.max(initial=0.0)) > max_coordinate:
+        unit = describe_unit(view.depth[view.valid])
+        reason = f"depth reaches {view.depth.max():.4g} m{unit}"
+        raise WrongViewError(view.name, reason, "give depth in metres")
+
+
+def describe_camera(view: View) -> str:
+    """Image size, focal lengths and principal point of a view's camera."""
+    height, width = view.depth.shape
+    (fx, _, cx), (_, fy, cy) = view.K[:2]
+    camera = f"focal lengths {fx:.4g}, {fy:.4g} and principal point {cx:.4g}, {cy:.4g} px"
+    return f"{width}×{height} pixels, {camera}"
+
+
+def check_depth(view: View) -> None:
+    """Reject a view whose readings are not depth along the optical axis, as its largest plane shows.
+
+    Raises:
+        WrongViewError: They are distances along rays, or inverse.
+    """
+    share = find_image_plane(view).share
+    kinds = {
+        "ray": (
+            "the distance along the ray of each pixel",
+            "divide it by the length of K⁻¹ (u, v, 1), or for a recording add --set recording.depth=ray",
+        ),
+        "inverse": ("inverse depth or disparity", "give its inverse, in metres"),
+    }
+    for kind, (what, remedy) in kinds.items():
+        other = find_image_plane(view, kind).share
+        if other >= LARGE and other > BETTER * share:
+            bent = f"as such, {other:.0%} of the readings lie on one plane, and only {share:.0%} otherwise"
+            reason = f"depth is {what}, not that along the optical axis: {bent}"
+            raise WrongViewError(view.name, reason, remedy)
+
+
+def describe_centre(view: View) -> str:
+    """Say that the principal point is far from the image's middle, as for another resolution; else ""."""
+    size, centre = np.array(view.depth.shape[::-1]), view.K[:2, 2]
+    if (np.abs(centre - (size - 1) / 2.0) <= OFF_CENTRE * size).all():
+        return ""
+    where = f"K has its principal point at ({centre[0]:.0f}, {centre[1]:.0f}) in {size[0]}×{size[1]} pixels"
+    if (K := scaled_camera(view)) is None:
+        return f"{where}; is K for another resolution?"
+    scale = K[0, 0] / view.K[0, 0]
+    whole = 8 * np.rint(size / scale / 8.0).astype(np.intp)  # as images are
+    other = f"if K is for a resolution of {whole[0]}×{whole[1]}"
+    return f"{where}; {other}, multiply its first two rows by {size[0] / whole[0]:.4g}"
+
+
+def scaled_camera(view: View) -> Array | None:
+    """K (3, 3) scaled to the view's image, if it is for one of the same shape and another size; else None."""
+    scales = np.array(view.depth.shape[::-1]) / (2.0 * view.K[:2, 2] + 1.0)
+    scale = float(np.sqrt(scales.prod())) if (scales > 0.0).all() else 0.0
+    if not OFF_CENTRE < abs(scale - 1.0) < np.inf or np.abs(np.log(scales / scale)).max() > 0.05:
+        return None
+    rows = np.array([[scale], [scale], [1.0]])
+    return np.asarray(view.K * rows, dtype=np.float64)
+
+
+def thin_view(view: View) -> View:
+    """A view of at most 160 columns, without colour and labels; its planes are the same."""
+    bare = replace(view, rgb=None, labels=None, normals_camera=None, ignored=None, names=None)
+    return bare.every(max(1, view.depth.shape[1] // 160))
+
+
+def name_causes(view: View) -> list[str]:
+    """Conventions, each with its remedy, in which the largest plane of a view with a pose would be level."""
+    plane = find_image_plane(view)
+    if plane.share < LARGE:
+        return []
+    normal = plane.normal_camera(view.K)
+    causes = [cause for cause, read in POSES.items() if _tilt(read(view.pose), normal) <= LEVEL]
+    if (K := scaled_camera(view)) is not None and _tilt(view.pose, plane.normal_camera(K)) <= LEVEL:
+        causes.append(OTHER_CAMERA)
+    readings = view.depth[view.valid]
+    if not causes and np.percentile(readings, 5.0) > BUFFER and readings.max() <= 1.0:
+        causes.append("depth is a buffer in [0, 1]: give metres")
+    return causes or [Z_UP]
+
+
+def explain_mismatch(first: View, other: View) -> str:
+    """Say in which convention or unit two views would show the same above the table; "" if in none.
+
+    Of a single view, the table alone may not tell; what stands on it does, from two sides.
+    """
+    shares = _overlaps([first, other])
+    best = max(shares, key=lambda cause: shares[cause])
+    return best if _is_sure(shares, best) else describe_centre(first)
+
+
+def _overlaps(views: Sequence[View]) -> dict[str, float]:
+    """Median share of what each view shows above the table that the one before shows too, by how it is read.
+
+    Read as declared, that is "".
+    """
+    readings: dict[str, tuple[Callable[[View], View], Callable[[Array], Array]]] = {
+        "": (_same, _same), **{cause: (_same, read) for cause, read in {**POSES, **UNITS}.items()},
+        "the images are mirrored: flip them": (_mirrored, _same),
+        OTHER_CAMERA: (_with_scaled_camera, _same),
+    }  # fmt: skip
+    changes = {change for change, _ in readings.values()}
+    shown = {change: [_Above.of(change(view)) for view in views] for change in changes}
+    poses, shares = [view.pose for view in views], {}
+    for cause, (change, read) in readings.items():
+        shares[cause] = _overlap(shown[change], [read(T) for T in poses])
+    if len(views) > 2:  # A clock that is off by less than a view does not tell.
+        shares[EARLY] = _overlap(shown[_same][:-1], poses[1:])
+        shares[LATE] = _overlap(shown[_same][1:], poses[:-1])
+    return shares
+
+
+def _is_sure(shares: Mapping[str, float], best: str) -> bool:
+    """Whether views agree when they are read in another way, and much less when read as declared."""
+    odds = [share / (1.0 - share) for share in np.clip([shares[best], shares[""]], 0.01, 0.99)]
+    return bool(best) and shares[best] >= OVERLAP and odds[0] > ODDS * odds[1]
+
+
+def _overlap(shown: Sequence[_Above], T_world_camera: Sequence[Array]) -> float:
+    clouds, shares = [view.points_world(T) for view, T in zip(shown, T_world_camera, strict=True)], []
+    for before, after in pairwise(clouds):
+        if min(len(before), len(after)) < LEAST:
+            shares.append(0.0)
+            continue
+        away, _ = cKDTree(before).query(after, distance_upper_bound=NEAR)
+        shares.append(float(np.isfinite(away).mean()))
+    return float(np.median(shares))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Above:
+    """What a view shows above its largest plane.
+
+    Attributes:
+        normal_camera: Normal (3,) of the plane.
+        points_camera: Points (N, 3) [m].
+    """
+
+    normal_camera: Array
+    points_camera: Array
+
+    @classmethod
+    def of(cls, view: View) -> _Above:
+        plane, index = find_image_plane(view), np.flatnonzero(view.valid)
+        v, u = np.divmod(index, view.depth.shape[1])
+        pixels, z = np.stack([u, v, np.ones(len(u))]), view.depth.ravel()[index].astype(np.float64)
+        above = np.flatnonzero(plane.affine @ pixels * z < 1.0 - 4.0 * FLAT)
+        above = above[:: max(1, len(above) // SAMPLES)] if plane.share >= LARGE else above[:0]
+        points = (np.linalg.inv(view.K) @ pixels[:, above] * z[above]).T
+        return cls(plane.normal_camera(view.K), points)
+
+    def points_world(self, T_world_camera: Array) -> Array:
+        """The points (N, 3) [m] from a pose (4, 4), if the plane is then level; else none."""
+        level = _tilt(T_world_camera, self.normal_camera) <= LEVEL
+        return transforms.transform(T_world_camera, self.points_camera[: None if level else 0])
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def _mirrored(view: View) -> View:
+    return replace(view, depth=np.ascontiguousarray(view.depth[:, ::-1]))
+
+
+def _with_scaled_camera(view: View) -> View:
+    K = scaled_camera(view)
+    return view if K is None else replace(view, K=K)
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What was found out about views.
+
+    Attributes:
+        views: What each is: its name, `width` and `height` [px], the share of pixels with a reading,
+            `near` and `far` between which nine in ten readings are [m], horizontal field of view [deg], the
+            share of the readings on its largest plane, and that plane's tilt [deg], or None without a pose.
+        problems: What is wrong, and how to mend it.
+    """
+
+    views: list[dict[str, Any]]
+    problems: list[str]
+
+
+def diagnose(views: Iterable[View], max_coordinate: float) -> Diagnosis:
+    """Find out what views show, and whether units, camera and poses are ours.
+
+    Args:
+        views: The views, each looked at once.
+        max_coordinate: Largest depth that is not in another unit [m].
+    """
+    rows, thin, found = list[dict[str, Any]](), list[View](), dict[str, list[str]]()
+    for view in views:
+        if not view.valid.any():
+            found.setdefault("omit it", []).append(f"{view.name} has no depth readings: omit it")
+            continue
+        near, far = np.percentile(view.depth[view.valid], (5.0, 95.0))
+        bare, plane, posed = thin_view(view), find_image_plane(view), view.T_world_camera is not None
+        said = {"": "", "K": describe_centre(view)}
+        if unit := describe_unit(view.depth[view.valid]):
+            said["unit"] = f"depth is {near:.4g}–{far:.4g} m{unit}: give metres"
+        for check in (partial(check_camera, max_coordinate=max_coordinate), check_depth):
+            try:
+                check(view)
+            except WrongViewError as error:
+                said["unit" if unit else error.remedy] = f"{error.reason}: {error.remedy}"
+        if posed and not _is_level_somewhere(bare):
+            causes = " or ".join(name_causes(bare))
+            said[causes] = causes
+        for key, text in said.items():
+            found.setdefault(key, []).extend([text] if text else [])
+        tilt = _tilt(view.pose, plane.normal_camera(view.K)) if posed else None
+        height, width = view.depth.shape
+        angle = np.degrees(np.arctan(width / view.K[0, 0] / 2.0))
+        rows.append(
+            {
+                "view": view.name, "width": width, "height": height, "readings": float(view.valid.mean()),
+                "near": float(near), "far": float(far), "field_of_view": float(2.0 * angle),
+                "plane": plane.share, "tilt": tilt,
+            }
+        )  # fmt: skip
+        thin += [bare] if posed else []
+    # One view may show a wall, and no table.
+    problems = [texts[0] for texts in found.values() if 2 * len(texts) > len(rows)]
+    if len(thin) > 1:
+        shares = _overlaps(thin)
+        best = max(shares, key=lambda cause: shares[cause])
+        problems += [best] if _is_sure(shares, best) and best not in problems else []
+    return Diagnosis(rows, problems)
+
+
+def _is_level_somewhere(view: View) -> bool:
+    """Whether one of the largest planes of a view with a pose is level."""
+    for _ in range(PLANES):
+        plane = find_image_plane(view)
+        if plane.share == 0.0 or _tilt(view.pose, plane.normal_camera(view.K)) <= LEVEL:
+            return plane.share > 0.0
+        v, u = np.indices(view.depth.shape)
+        off = np.abs(
+            plane.affine @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1) * view.depth.ravel() - 1.0
+        )
+        view = replace(
+            view, depth=np.where(off.reshape(view.depth.shape) < 2.0 * FLAT, np.float32(0.0), view.depth)
+        )
+    return False
+
+
+def _tilt(T_world_camera: Array, normal_camera: Array) -> float:
+    """Angle [deg] between a plane's normal and the vertical."""
+    return float(np.degrees(transforms.angle_between(transforms.rotate(T_world_camera, normal_camera), UP)))
+
+
+def describe_unit(readings: NDArray[np.floating]) -> str:
+    """Say in which other unit readings (N,) would be about a metre, as of a table; else ""."""
+    units = {"millimetres": 1e-3, "centimetres": 1e-2, "tenths of a millimetre": 1e-4, "kilometres": 1e3}
+    median, factors = float(np.median(readings)), {"": 1.0, **units}
+    unit = min(factors, key=lambda name: abs(np.log(median * factors[name])))
+    return f", as if in {unit}" if unit else ""

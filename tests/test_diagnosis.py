@@ -1,0 +1,93 @@
+"""What is said of recordings whose units, camera, axes or poses are not ours, and that following it helps."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import run_command
+
+import caryatid as ct
+from caryatid.config.settings import read_settings
+from caryatid.geometry import transforms
+from caryatid.io import write_recording
+from caryatid.io.datasets import SAMPLES, open_dataset
+from caryatid.segmentation.diagnosis import BODY, GL, Y_UP, diagnose, ray_lengths
+
+K_ROWS = np.array([[2.0], [2.0], [1.0]])
+
+
+@pytest.fixture(scope="module")
+def sound():
+    return list(open_dataset(SAMPLES / "sample-recording"))[:5]
+
+
+def posed(change):
+    return lambda view: view.with_pose(change(view.pose))
+
+
+def deep(change):
+    return lambda view: replace(view, depth=change(view).astype(np.float32))
+
+
+FAULTS = {
+    "in millimetres: give depth in metres": deep(lambda v: 1e3 * v.depth),
+    "the distance along the ray": deep(lambda v: v.depth * ray_lengths(v)),
+    "inverse depth": deep(lambda v: np.where(v.valid, 1.0 / np.maximum(v.depth, 0.1), 0.0)),
+    "K is for a resolution of 640×480, multiply its first two rows by 0.5": lambda v: replace(
+        v, K=K_ROWS * v.K
+    ),
+    "camera axes are OpenGL's .*recording.axes=opengl": posed(lambda T: T @ GL),
+    "camera's body .*recording.axes=body": posed(lambda T: T @ BODY.T),
+    "is the inverse": posed(transforms.invert),
+    "y axis points up.*--level": posed(lambda T: Y_UP.T @ T),
+    "translation of T_world_camera in millimetres": posed(
+        lambda T: transforms.rigid(T[:3, :3], 10.0 * T[:3, 3] * 100.0)
+    ),
+    "mirrored": lambda v: replace(v, depth=v.depth[:, ::-1].copy(), rgb=None, labels=None),
+}
+
+
+def test_of_a_sound_recording_nothing_is_said(sound):
+    found = diagnose(sound, 1000.0)
+    assert found.problems == []
+    assert [row["view"] for row in found.views] == [view.name for view in sound]
+    assert max(row["tilt"] for row in found.views) < 1.0
+
+
+@pytest.mark.parametrize("said", FAULTS)
+def test_a_fault_is_named_with_its_remedy(sound, said):
+    problems = diagnose([FAULTS[said](view) for view in sound], 1000.0).problems
+    assert any(re.search(said, problem) for problem in problems), problems
+
+
+def test_a_scene_refuses_what_no_pose_can_mend(sound):
+    view = deep(lambda v: v.depth * ray_lengths(v))(sound[0])
+    with pytest.raises(ct.InputError, match=r"along the ray of each pixel.*recording\.depth=ray"):
+        ct.Scene().update(view)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("spoil", "setting"),
+    [
+        (posed(lambda T: T @ GL), "recording.axes=opengl"),
+        (posed(lambda T: T @ BODY.T), "recording.axes=body"),
+        (deep(lambda v: v.depth * ray_lengths(v)), "recording.depth=ray"),
+    ],
+    ids=["opengl", "body", "ray"],
+)
+def test_following_what_check_says_gives_the_same_recording(sound, spoil, setting, tmp_path, capsys):
+    write_recording(tmp_path / "spoilt", [spoil(view) for view in sound])
+    assert run_command("check", tmp_path / "spoilt", "--json") == 1
+    document = json.loads(capsys.readouterr().out)
+    assert any(f"--set {setting}" in problem for problem in document["problems"])
+    assert run_command("check", tmp_path / "spoilt", "--set", setting) == 0
+    assert capsys.readouterr().out.endswith("nothing is wrong\n")
+    config = read_settings(None, [setting])
+    for view, right in zip(open_dataset(tmp_path / "spoilt", config.recording), sound, strict=True):
+        assert np.allclose(view.pose, right.pose, atol=1e-6)
+        assert np.allclose(view.depth, right.depth, atol=1e-3)
