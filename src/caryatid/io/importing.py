@@ -22,7 +22,7 @@ from caryatid.io.datasets import NO_COLOUR, NO_POSE, Dataset, Frame, OpenOptions
 from caryatid.io.images import BrokenImageError
 from caryatid.io.staging import StagedFolder
 from caryatid.io.video import SECOND
-from caryatid.segmentation.diagnosis import GL_AXES
+from caryatid.segmentation.diagnosis import GL_AXES, check_camera
 from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import View
 
@@ -185,6 +185,7 @@ def _level_rotation(dataset: Dataset, config: Config) -> Array:
     """
     rng, found, eyes, sights = np.random.default_rng(0), [], [], []
     for view in dataset:
+        check_camera(view, config.cloud.max_coordinate)
         with suppress(PerceptionError):
             T_level_camera = level_transform(replace(view, T_world_camera=None), config, rng)
             found.append(transforms.rotate(view.pose, T_level_camera[2, :3]))
