@@ -98,7 +98,7 @@ class Table(Node):
 
     def _go_home(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.pose, self._way = self._home, None
-        response.success = min(t.get_subscription_count() for t in (self._tf_topic, self._info_topic)) > 0
+        response.success = self._info_topic.get_subscription_count() > 0
         return response
 
     def _move(self) -> None:
