@@ -61,6 +61,7 @@ class Client(Node):
 
     Attributes:
         graphs, decisions, logs, stages, detections: What was published so far.
+        stages_seen: Number of stages up to the one that a test has waited for.
         action, service_clients: The clients of rclpy.
     """
 
@@ -71,6 +72,7 @@ class Client(Node):
         self.decisions: list[Decision] = []
         self.logs: list[Log] = []
         self.stages: list[str] = []
+        self.stages_seen = 0
         self.create_subscription(SupportGraph, "/support_graph", self.graphs.append, latched)
         self.create_subscription(Decision, "/decision", self.decisions.append, 10)
         self.create_subscription(Log, "/rosout", self.logs.append, 100)
@@ -96,6 +98,7 @@ class Client(Node):
     def explore(self, **fields: Any) -> Goal:
         """Send a goal."""
         assert self.action.wait_for_server(20.0), "there is no action server"
+        self.stages_seen = len(self.stages)
         return Goal(self.action, Explore.Goal(**fields))
 
     def call(self, name: str, seconds: float = 30.0, **fields: Any) -> Any:

@@ -86,9 +86,13 @@ def within(seconds, call):
 
 
 def at_stage(client, text, seconds: float = 30.0):
-    """Wait until the node tells a stage that it has not told before."""
-    known = len(client.stages)
-    wait_for(lambda: any(text in stage for stage in client.stages[known:]), seconds, text)
+    """Wait until the node tells a stage, in this goal and after the one that was waited for before."""
+
+    def later():
+        found = (n for n, stage in enumerate(client.stages) if n >= client.stages_seen and text in stage)
+        return next(found, -1) + 1
+
+    client.stages_seen = wait_for(later, seconds, text)
 
 
 @pytest.fixture(scope="session", autouse=True)
