@@ -161,9 +161,10 @@ class Page:
         self.server.scene.set_up_direction("+z")
         self._notice = gui.add_html("", order=-20, visible=False)
         hint = "Go back to an earlier view"
-        self._slider = gui.add_slider("view", 1, 2, 1, 1, visible=False, hint=hint)
+        # Without an order, a later page of the same process would have it below the layers.
+        self._slider = gui.add_slider("view", 1, 2, 1, 1, order=0, visible=False, hint=hint)
         self._slider.on_update(lambda _: self.go_to(int(self._slider.value) - 1))
-        self._summary = gui.add_html("")
+        self._summary = gui.add_html("", order=1)
         self._boxes: dict[str, Any] = {}
         with gui.add_folder("show", order=90):
             for name, shown in LAYERS.items():
