@@ -166,7 +166,7 @@ class Mutations(OnScenes):
             logging.getLogger("caryatid").addHandler(handler)
             try:
                 spoilt = spoil(views, float(rng.uniform()))
-                problems = diagnose(spoilt, config.cloud.max_coordinate).problems
+                problems = diagnose(spoilt, config).problems
                 named = any(re.search(pattern, problem) for problem in problems)
                 if not problems:
                     model = Scene(config, segmentation="auto", seed=self.seed)

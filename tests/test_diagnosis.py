@@ -9,9 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import run_command
+from raycast import TABLE, from_the_side, table_scene
 
 import caryatid as ct
 from caryatid.config.settings import read_settings
+from caryatid.config.stages import Config
 from caryatid.geometry import transforms
 from caryatid.io import write_recording
 from caryatid.io.datasets import SAMPLES, open_dataset
@@ -34,7 +36,7 @@ def deep(change):
 
 
 FAULTS = {
-    "in millimetres: give depth in metres": deep(lambda v: 1e3 * v.depth),
+    "as if in millimetres: give metres": deep(lambda v: 1e3 * v.depth),
     "the distance along the ray": deep(lambda v: v.depth * ray_lengths(v)),
     "inverse depth": deep(lambda v: np.where(v.valid, 1.0 / np.maximum(v.depth, 0.1), 0.0)),
     "K is for a resolution of 640×480, multiply its first two rows by 0.5": lambda v: replace(
@@ -45,14 +47,14 @@ FAULTS = {
     "is the inverse": posed(transforms.invert),
     "y axis points up.*--level": posed(lambda T: Y_UP.T @ T),
     "translation of T_world_camera in millimetres": posed(
-        lambda T: transforms.rigid(T[:3, :3], 10.0 * T[:3, 3] * 100.0)
+        lambda T: transforms.rigid(T[:3, :3], 1e3 * T[:3, 3])
     ),
     "mirrored": lambda v: replace(v, depth=v.depth[:, ::-1].copy(), rgb=None, labels=None),
 }
 
 
 def test_of_a_sound_recording_nothing_is_said(sound):
-    found = diagnose(sound, 1000.0)
+    found = diagnose(sound, Config())
     assert found.problems == []
     assert [row["view"] for row in found.views] == [view.name for view in sound]
     assert max(row["tilt"] for row in found.views) < 1.0
@@ -60,8 +62,23 @@ def test_of_a_sound_recording_nothing_is_said(sound):
 
 @pytest.mark.parametrize("said", FAULTS)
 def test_a_fault_is_named_with_its_remedy(sound, said):
-    problems = diagnose([FAULTS[said](view) for view in sound], 1000.0).problems
+    problems = diagnose([FAULTS[said](view) for view in sound], Config()).problems
     assert any(re.search(said, problem) for problem in problems), problems
+
+
+def test_a_wall_larger_than_the_table_is_no_fault():
+    behind = (np.array([-0.4, 0.0, TABLE + 0.5]), np.array([0.02, 3.0, 1.5]))
+    view = table_scene(from_the_side(0.0, 20.0), [behind])
+    found = diagnose([view], Config())
+    assert found.views[0]["tilt"] > 80.0
+    assert found.problems == []
+
+
+def test_a_principal_point_outside_the_image_is_said(sound):
+    K = sound[0].K.copy()
+    K[:2, 2] = -0.5, -0.5
+    problems = diagnose([replace(sound[0], K=K)], Config()).problems
+    assert "K has its principal point at (-0, -0) in 320×240 pixels; is K for another resolution?" in problems
 
 
 def test_a_scene_refuses_what_no_pose_can_mend(sound):

@@ -175,6 +175,17 @@ RED, BLUE, GREY = (200, 30, 30), (30, 30, 200), (150, 150, 150)
 PRINTS = np.kron(np.random.default_rng(0).integers(0, 255, (32, 43, 3)), np.ones((15, 15, 1)))[:480, :640]
 
 
+def flush_boxes(left, right, line=0.0):
+    """Two boxes side by side, and a dark line along a share of the border between them."""
+    boxes = [solid(0.0, y, 0.05, 0.12, 0.1, 0.1) for y in (-0.0505, 0.0505)]
+    view = table_scene(from_the_side(elevation=60.0, distance=1.0), boxes, sigma=0.001)
+    own = [view.labels == k for k in (1, 2)]
+    rgb = np.where(own[0][..., None], left, np.where(own[1][..., None], right, 200.0))
+    border = np.argwhere(np.logical_and(*(ndimage.binary_dilation(mask, iterations=2) for mask in own)))
+    rgb[tuple(border[: int(line * len(border))].T)] = 110.0
+    return with_colours(view, rgb)
+
+
 @pytest.mark.parametrize(
     ("left", "right", "line", "number"),
     [
@@ -188,16 +199,20 @@ PRINTS = np.kron(np.random.default_rng(0).integers(0, 255, (32, 43, 3)), np.ones
     ids=["alike", "half a line", "a dark line", "two colours", "two shades", "printed"],
 )
 def test_flush_boxes_are_two_where_their_colours_or_a_dark_line_say_so(left, right, line, number):
-    boxes = [solid(0.0, y, 0.05, 0.12, 0.1, 0.1) for y in (-0.0505, 0.0505)]
-    view = table_scene(from_the_side(elevation=60.0, distance=1.0), boxes, sigma=0.001)
-    own = [view.labels == k for k in (1, 2)]
-    rgb = np.where(own[0][..., None], left, np.where(own[1][..., None], right, 200.0))
-    border = np.argwhere(np.logical_and(*(ndimage.binary_dilation(mask, iterations=2) for mask in own)))
-    rgb[tuple(border[: int(line * len(border))].T)] = 110.0
-    scene = model_of([with_colours(view, rgb)], segmentation="auto")
+    view = flush_boxes(left, right, line)
+    scene = model_of([view], segmentation="auto")
     assert sum(o.role == "object" for o in scene.graph.objects) == number
     labels = np.where(scene.labels > MAX_LABEL, 0, scene.labels)
     assert number == 1 or found(labels, view.labels) == (2, 2, 2)
+
+
+def test_one_side_of_a_seam_may_be_furniture(monkeypatch):
+    def find_first(points, index, stands_on, *_):
+        return np.arange(len(stands_on)) == 0
+
+    monkeypatch.setattr("caryatid.segmentation.observation.find_furniture", find_first)
+    graph = model_of([flush_boxes(GREY, GREY, 1.0)], segmentation="auto").graph
+    assert sum(o.role == "object" for o in graph.objects) == 1
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.001])

@@ -26,7 +26,7 @@ from caryatid.graph import (
     label_of,
     object_id,
 )
-from caryatid.objects.changes import ChangeDetector, appeared, describe_through
+from caryatid.objects.changes import ChangeDetector, appeared, describe_contradiction
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed, without
 from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
@@ -431,7 +431,7 @@ class Scene(Pictured):
             unexplained = observation.cloud.select(
                 np.isin(observation.labels, sorted(objects - new.keys() or objects))
             )
-            if doubt := describe_through(unexplained, self.surface, before, self.config):
+            if doubt := describe_contradiction(unexplained, self.surface, before, self.config):
                 cause = self._cause_of_mismatch(observation.view)
                 log.warning("%s: %s; %s", source.name, doubt, cause or "its pose is wrong, or objects moved")
         if not named:
@@ -556,7 +556,9 @@ class Scene(Pictured):
 
     def _cause_of_mismatch(self, view: View) -> str:
         """Why a view's pose does not fit that of the first view, or ""."""
-        return "" if self._first is None else explain_mismatch(self._first, thin_view(view))
+        if self._first is None:
+            return ""
+        return explain_mismatch(self._first, thin_view(view), self.config.surface.max_tilt)
 
     def _fused_surfaces(self, observation: Observation) -> tuple[SupportSurface, ...]:
         """The support surfaces from the points of all views."""

@@ -39,7 +39,7 @@ def check_views(command: Check) -> int:
     config, source = command.settings.read(), command.source
     dataset = open_dataset(source, config.recording)
     with command.output.working("looking"):
-        found = diagnose(dataset, config.cloud.max_coordinate)
+        found = diagnose(dataset, config)
     columns = {
         "view": "view", "size": "size\n[px]", "field_of_view": "width\n[°]", "readings": "readings",
         "near": "near\n[m]", "far": "far\n[m]", "plane": "largest\nplane", "tilt": "tilt\n[°]",
@@ -79,13 +79,14 @@ def import_log(command: Import) -> None:
         {"view": n, "frame": f.number, "time": f.time, "posed": f.T_world_camera is not None}
         for n, f in enumerate(imported.frames)
     ]
-    document = {"recording": str(out), "frames": read, "views": views}
-    output.result(document | {"skipped": imported.skipped, "notes": list(imported.notes)}, "")
+    problems = diagnose(imported, config).problems
+    document = {"recording": str(out), "frames": read, "views": views, "skipped": imported.skipped}
+    output.result(document | {"notes": list(imported.notes), "problems": problems}, "")
     for note in imported.notes:
         output.say(note)
     skipped = f"; skipped: {reasons(imported.skipped)}" if imported.skipped else ""
     output.say(f"{source.name}: {len(imported)} views of {read} frames{skipped}")
-    for problem in diagnose(imported, config.cloud.max_coordinate).problems:
+    for problem in problems:
         output.say(f"wrong: {problem}")
     output.say(f"recording: {out}; next, run `caryatid extract {out} --out run`")
 

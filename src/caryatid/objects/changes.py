@@ -155,7 +155,7 @@ def appeared(
     return new
 
 
-def describe_through(cloud: Cloud, surface: SupportSurface, voxels: VoxelMap, config: Config) -> str:
+def describe_contradiction(cloud: Cloud, surface: SupportSurface, voxels: VoxelMap, config: Config) -> str:
     """Say how much of what a view shows above the table earlier views looked through; "" if too little.
 
     They looked through it and into what is behind.

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from caryatid.config.stages import Config
 from caryatid.errors import WrongViewError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import UP, Array
@@ -34,24 +35,17 @@ PLANES = 3
 FLAT = 0.005
 """Deviation of a reading from a plane, relative to the reading [1]: noise of depth cameras up to 3 m."""
 LARGE = 0.2
-"""Minimum share of the readings on a plane that says of what kind they are [1]."""
-BETTER = 1.5
-"""How many times more readings another kind of depth must put on one plane [1]: a wrong kind puts at most
-1.0 times as many there as the right one in 63 real images; turned into another, 55 of them show more."""
-LEVEL = 10.0
-"""Maximum tilt of a plane that counts as level [deg]; as `surface.max_tilt`."""
+"""Minimum share that says something: of the readings on one plane, and of what two views both show [1]."""
+ODDS = 2.5
+"""How many times the odds of such a share must be those of the share as declared [1]."""
 BUFFER = 0.8
 """What nearly all values of a depth buffer exceed, if its near plane is at up to a fifth of the depth [1]."""
 OFF_CENTRE = 0.2
 """How far the principal point may be from the image's middle [image widths and heights]."""
-OVERLAP = 0.3
-"""Minimum share of points above the table that another view shows too, if poses are as supposed [1]."""
-ODDS = 2.5
-"""How many times the odds of that share must be those with the poses as declared [1]."""
 NEAR = 0.015
 """Distance of the same point in two views [m]; poses are off by about 1 cm."""
 LEAST = 20
-"""Minimum number of points above the table for that [1]."""
+"""Minimum number of points above the table that tell whether two views show the same [1]."""
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Axes (4, 4) of OpenCV's camera frame, the optical one, in OpenGL's."""
@@ -62,7 +56,9 @@ Y_UP = transforms.rigid([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], np
 Z_UP = "rotate the world so that its z axis points up (on the command line: --level)"
 """Remedy for a world frame that is not level."""
 EARLY = "each pose is that of the view before: check the clocks of camera and poses"
+"""A cause of wrong camera poses, and its remedy."""
 LATE = "each pose is that of the view after: check the clocks of camera and poses"
+"""A cause of wrong camera poses, and its remedy."""
 OTHER_CAMERA = "K is for another resolution: multiply its first two rows by the ratio of the image sizes"
 """A cause of wrong lengths, and its remedy."""
 GL_AXES = (
@@ -77,17 +73,17 @@ BODY_AXES = (
 """A cause of a wrong camera pose, and its remedy."""
 
 
-def _rolled(T: Array, by: int) -> Array:
+def _roll_quaternion(T: Array, by: int) -> Array:
     quaternion = np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), by)
     return transforms.rigid(Rotation.from_quat(quaternion).as_matrix(), T[:3, 3])
 
 
-def _turned(T: Array, angle: float) -> Array:
+def _turn_camera(T: Array, angle: float) -> Array:
     turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()
     return transforms.rigid(T[:3, :3] @ turn, T[:3, 3])
 
 
-def _scaled(T: Array, factor: float) -> Array:
+def _scale_translation(T: Array, factor: float) -> Array:
     return transforms.rigid(T[:3, :3], factor * T[:3, 3])
 
 
@@ -98,11 +94,15 @@ POSES: Mapping[str, Callable[[Array], Array]] = {
     f"the world's y axis points up: {Z_UP}": lambda T: Y_UP @ T,
     f"{GL_AXES}, and the world's y axis points up: {Z_UP}": lambda T: Y_UP @ T @ GL,
     f"the world's z axis points down: {Z_UP}": lambda T: GL @ T,
-    "the quaternion of the pose begins with w, but was read as x y z w: reorder it": partial(_rolled, by=-1),
-    "the quaternion of the pose ends with w, but was read as w x y z: reorder it": partial(_rolled, by=1),
+    "the quaternion of the pose begins with w, but was read as x y z w: reorder it": partial(
+        _roll_quaternion, by=-1
+    ),
+    "the quaternion of the pose ends with w, but was read as w x y z: reorder it": partial(
+        _roll_quaternion, by=1
+    ),
     **{
         f"the image is turned by {angle}° against its pose: turn image and K back": partial(
-            _turned, angle=angle
+            _turn_camera, angle=angle
         )
         for angle in (90, 180, -90)
     },
@@ -110,7 +110,7 @@ POSES: Mapping[str, Callable[[Array], Array]] = {
 """Conventions of poses (4, 4) other than ours, with their remedy, and how to read such a pose."""
 UNITS: Mapping[str, Callable[[Array], Array]] = {
     f"depth is in metres, and the translation of T_world_camera in {unit}: give both in metres": partial(
-        _scaled, factor=factor
+        _scale_translation, factor=factor
     )
     for unit, factor in {
         "kilometres": 1e3,
@@ -155,7 +155,7 @@ def find_image_plane(view: View, kind: str = "axis") -> ImagePlane:
     pixels, w = np.stack([u, v, np.ones(len(u))]), view.depth.ravel()[index].astype(np.float64)
     q = w if kind == "inverse" else 1.0 / w
     if kind == "ray":
-        q = q * ray_lengths(view).ravel()[index]
+        q = q * np.linalg.norm(np.linalg.inv(view.K) @ pixels, axis=0)
     triples = rng.integers(0, len(q), (TRIALS, 3))
     corners = pixels.T[triples]
     proper = np.abs(np.linalg.det(corners)) > 1.0
@@ -217,7 +217,7 @@ def check_depth(view: View) -> None:
     Raises:
         WrongViewError: They are distances along rays, or inverse.
     """
-    share = find_image_plane(view).share
+    declared = find_image_plane(view).share
     kinds = {
         "ray": (
             "the distance along the ray of each pixel",
@@ -226,9 +226,9 @@ def check_depth(view: View) -> None:
         "inverse": ("inverse depth or disparity", "give its inverse, in metres"),
     }
     for kind, (what, remedy) in kinds.items():
-        other = find_image_plane(view, kind).share
-        if other >= LARGE and other > BETTER * share:
-            bent = f"as such, {other:.0%} of the readings lie on one plane, and only {share:.0%} otherwise"
+        share = find_image_plane(view, kind).share
+        if _is_better(share, declared):
+            bent = f"as such, {share:.0%} of the readings lie on one plane, and only {declared:.0%} otherwise"
             reason = f"depth is {what}, not that along the optical axis: {bent}"
             raise WrongViewError(view.name, reason, remedy)
 
@@ -249,9 +249,11 @@ def describe_centre(view: View) -> str:
 
 def scaled_camera(view: View) -> Array | None:
     """K (3, 3) scaled to the view's image, if it is for one of the same shape and another size; else None."""
+    if (view.K[:2, 2] < 0.0).any():
+        return None
     scales = np.array(view.depth.shape[::-1]) / (2.0 * view.K[:2, 2] + 1.0)
-    scale = float(np.sqrt(scales.prod())) if (scales > 0.0).all() else 0.0
-    if not OFF_CENTRE < abs(scale - 1.0) < np.inf or np.abs(np.log(scales / scale)).max() > 0.05:
+    scale = float(np.sqrt(scales.prod()))
+    if abs(scale - 1.0) <= OFF_CENTRE or np.abs(np.log(scales / scale)).max() > 0.05:
         return None
     rows = np.array([[scale], [scale], [1.0]])
     return np.asarray(view.K * rows, dtype=np.float64)
@@ -263,14 +265,19 @@ def thin_view(view: View) -> View:
     return bare.every(max(1, view.depth.shape[1] // 160))
 
 
-def name_causes(view: View) -> list[str]:
-    """Conventions, each with its remedy, in which the largest plane of a view with a pose would be level."""
+def name_causes(view: View, max_tilt: float) -> list[str]:
+    """Name conventions, with their remedies, in which the largest plane of a view with a pose is level.
+
+    Args:
+        view: The view.
+        max_tilt: Maximum tilt of a plane that counts as level [deg].
+    """
     plane = find_image_plane(view)
     if plane.share < LARGE:
         return []
     normal = plane.normal_camera(view.K)
-    causes = [cause for cause, read in POSES.items() if _tilt(read(view.pose), normal) <= LEVEL]
-    if (K := scaled_camera(view)) is not None and _tilt(view.pose, plane.normal_camera(K)) <= LEVEL:
+    causes = [cause for cause, read in POSES.items() if _tilt(read(view.pose), normal) <= max_tilt]
+    if (K := scaled_camera(view)) is not None and _tilt(view.pose, plane.normal_camera(K)) <= max_tilt:
         causes.append(OTHER_CAMERA)
     readings = view.depth[view.valid]
     if not causes and np.percentile(readings, 5.0) > BUFFER and readings.max() <= 1.0:
@@ -278,45 +285,55 @@ def name_causes(view: View) -> list[str]:
     return causes or [Z_UP]
 
 
-def explain_mismatch(first: View, other: View) -> str:
+def explain_mismatch(first: View, other: View, max_tilt: float) -> str:
     """Say in which convention or unit two views would show the same above the table; "" if in none.
 
     Of a single view, the table alone may not tell; what stands on it does, from two sides.
+
+    Args:
+        first: A view with a pose.
+        other: A later one.
+        max_tilt: Maximum tilt of a plane that counts as level [deg].
     """
-    shares = _overlaps([first, other])
-    best = max(shares, key=lambda cause: shares[cause])
-    return best if _is_sure(shares, best) else describe_centre(first)
+    shares = _overlaps([first, other], max_tilt)
+    return _best_reading(shares) or describe_centre(first)
 
 
-def _overlaps(views: Sequence[View]) -> dict[str, float]:
+def _overlaps(views: Sequence[View], max_tilt: float) -> dict[str, float]:
     """Median share of what each view shows above the table that the one before shows too, by how it is read.
 
     Read as declared, that is "".
     """
     readings: dict[str, tuple[Callable[[View], View], Callable[[Array], Array]]] = {
-        "": (_same, _same), **{cause: (_same, read) for cause, read in {**POSES, **UNITS}.items()},
-        "the images are mirrored: flip them": (_mirrored, _same),
-        OTHER_CAMERA: (_with_scaled_camera, _same),
+        "": (_keep, _keep), **{cause: (_keep, read) for cause, read in {**POSES, **UNITS}.items()},
+        "the images are mirrored: flip them": (_mirror, _keep),
+        OTHER_CAMERA: (_scale_camera, _keep),
     }  # fmt: skip
     changes = {change for change, _ in readings.values()}
-    shown = {change: [_Above.of(change(view)) for view in views] for change in changes}
+    shown = {change: [_RaisedPoints.of(change(view)) for view in views] for change in changes}
     poses, shares = [view.pose for view in views], {}
     for cause, (change, read) in readings.items():
-        shares[cause] = _overlap(shown[change], [read(T) for T in poses])
+        shares[cause] = _overlap(shown[change], [read(T) for T in poses], max_tilt)
     if len(views) > 2:  # A clock that is off by less than a view does not tell.
-        shares[EARLY] = _overlap(shown[_same][:-1], poses[1:])
-        shares[LATE] = _overlap(shown[_same][1:], poses[:-1])
+        shares[EARLY] = _overlap(shown[_keep][:-1], poses[1:], max_tilt)
+        shares[LATE] = _overlap(shown[_keep][1:], poses[:-1], max_tilt)
     return shares
 
 
-def _is_sure(shares: Mapping[str, float], best: str) -> bool:
-    """Whether views agree when they are read in another way, and much less when read as declared."""
-    odds = [share / (1.0 - share) for share in np.clip([shares[best], shares[""]], 0.01, 0.99)]
-    return bool(best) and shares[best] >= OVERLAP and odds[0] > ODDS * odds[1]
+def _best_reading(shares: Mapping[str, float]) -> str:
+    """How views are to be read to agree; "" if as declared, or if nothing is sure."""
+    best = max(shares, key=lambda cause: shares[cause])
+    return best if _is_better(shares[best], shares[""]) else ""
 
 
-def _overlap(shown: Sequence[_Above], T_world_camera: Sequence[Array]) -> float:
-    clouds, shares = [view.points_world(T) for view, T in zip(shown, T_world_camera, strict=True)], []
+def _is_better(share: float, declared: float) -> bool:
+    """Whether a share is large, and much larger than the one as declared."""
+    odds, odds_declared = (p / (1.0 - p) for p in np.clip([share, declared], 0.01, 0.99))
+    return bool(share >= LARGE and odds > ODDS * odds_declared)
+
+
+def _overlap(shown: Sequence[_RaisedPoints], poses: Sequence[Array], max_tilt: float) -> float:
+    clouds, shares = [view.points_world(T, max_tilt) for view, T in zip(shown, poses, strict=True)], []
     for before, after in pairwise(clouds):
         if min(len(before), len(after)) < LEAST:
             shares.append(0.0)
@@ -327,7 +344,7 @@ def _overlap(shown: Sequence[_Above], T_world_camera: Sequence[Array]) -> float:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Above:
+class _RaisedPoints:
     """What a view shows above its largest plane.
 
     Attributes:
@@ -339,7 +356,7 @@ class _Above:
     points_camera: Array
 
     @classmethod
-    def of(cls, view: View) -> _Above:
+    def of(cls, view: View) -> _RaisedPoints:
         plane, index = find_image_plane(view), np.flatnonzero(view.valid)
         v, u = np.divmod(index, view.depth.shape[1])
         pixels, z = np.stack([u, v, np.ones(len(u))]), view.depth.ravel()[index].astype(np.float64)
@@ -348,21 +365,21 @@ class _Above:
         points = (np.linalg.inv(view.K) @ pixels[:, above] * z[above]).T
         return cls(plane.normal_camera(view.K), points)
 
-    def points_world(self, T_world_camera: Array) -> Array:
-        """The points (N, 3) [m] from a pose (4, 4), if the plane is then level; else none."""
-        level = _tilt(T_world_camera, self.normal_camera) <= LEVEL
+    def points_world(self, T_world_camera: Array, max_tilt: float) -> Array:
+        """The points (N, 3) [m] from a pose (4, 4), if the plane is then tilted by at most so much [deg]."""
+        level = _tilt(T_world_camera, self.normal_camera) <= max_tilt
         return transforms.transform(T_world_camera, self.points_camera[: None if level else 0])
 
 
-def _same(value: Any) -> Any:
+def _keep(value: Any) -> Any:
     return value
 
 
-def _mirrored(view: View) -> View:
+def _mirror(view: View) -> View:
     return replace(view, depth=np.ascontiguousarray(view.depth[:, ::-1]))
 
 
-def _with_scaled_camera(view: View) -> View:
+def _scale_camera(view: View) -> View:
     K = scaled_camera(view)
     return view if K is None else replace(view, K=K)
 
@@ -382,14 +399,15 @@ class Diagnosis:
     problems: list[str]
 
 
-def diagnose(views: Iterable[View], max_coordinate: float) -> Diagnosis:
+def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
     """Find out what views show, and whether units, camera and poses are ours.
 
     Args:
         views: The views, each looked at once.
-        max_coordinate: Largest depth that is not in another unit [m].
+        config: The largest depth, and the tilt of a level plane.
     """
     rows, thin, found = list[dict[str, Any]](), list[View](), dict[str, list[str]]()
+    max_tilt = config.surface.max_tilt
     for view in views:
         if not view.valid.any():
             found.setdefault("omit it", []).append(f"{view.name} has no depth readings: omit it")
@@ -399,13 +417,13 @@ def diagnose(views: Iterable[View], max_coordinate: float) -> Diagnosis:
         said = {"": "", "K": describe_centre(view)}
         if unit := describe_unit(view.depth[view.valid]):
             said["unit"] = f"depth is {near:.4g}–{far:.4g} m{unit}: give metres"
-        for check in (partial(check_camera, max_coordinate=max_coordinate), check_depth):
+        for check in (partial(check_camera, max_coordinate=config.cloud.max_coordinate), check_depth):
             try:
                 check(view)
             except WrongViewError as error:
                 said["unit" if unit else error.remedy] = f"{error.reason}: {error.remedy}"
-        if posed and not _is_level_somewhere(bare):
-            causes = " or ".join(name_causes(bare))
+        if posed and not _is_level_somewhere(bare, max_tilt):
+            causes = " or ".join(name_causes(bare, max_tilt))
             said[causes] = causes
         for key, text in said.items():
             found.setdefault(key, []).extend([text] if text else [])
@@ -423,17 +441,16 @@ def diagnose(views: Iterable[View], max_coordinate: float) -> Diagnosis:
     # One view may show a wall, and no table.
     problems = [texts[0] for texts in found.values() if 2 * len(texts) > len(rows)]
     if len(thin) > 1:
-        shares = _overlaps(thin)
-        best = max(shares, key=lambda cause: shares[cause])
-        problems += [best] if _is_sure(shares, best) and best not in problems else []
+        best = _best_reading(_overlaps(thin, max_tilt))
+        problems += [best] if best and best not in problems else []
     return Diagnosis(rows, problems)
 
 
-def _is_level_somewhere(view: View) -> bool:
+def _is_level_somewhere(view: View, max_tilt: float) -> bool:
     """Whether one of the largest planes of a view with a pose is level."""
     for _ in range(PLANES):
         plane = find_image_plane(view)
-        if plane.share == 0.0 or _tilt(view.pose, plane.normal_camera(view.K)) <= LEVEL:
+        if plane.share == 0.0 or _tilt(view.pose, plane.normal_camera(view.K)) <= max_tilt:
             return plane.share > 0.0
         v, u = np.indices(view.depth.shape)
         off = np.abs(

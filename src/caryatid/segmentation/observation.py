@@ -157,7 +157,7 @@ def observe(
     try:
         surfaces = find_surfaces(cloud, given, known, UP, config, rng, pose)
     except NoSurfaceError as error:
-        causes = name_causes(whole) if isinstance(whole, View) else []
+        causes = name_causes(whole, config.surface.max_tilt) if isinstance(whole, View) else []
         tilted = f" or, if that plane is the table, {' or '.join(causes)}" if causes else ""
         raise NoSurfaceError(f"{error}{tilted}") from None
     if isinstance(source, View):

@@ -86,8 +86,8 @@ def segment(
     over = surface.pixels_over(view, 0.0, np.inf, -surface.core.size, core=True)[samples.grid][samples.places]
     proper = wide[part]
     part = np.where(proper, part, 0)
-    juts = find_jutting(samples, part, over, -config.margin * up, 2.0 * config.edge_jump)[part]
-    part = _with_share(part, over | juts, OVER)
+    overhang = find_overhangs(samples, part, over, -config.margin * up, 2.0 * config.edge_jump)[part]
+    part = _with_share(part, over | overhang, OVER)
     uncut, width = samples.image(part), GAP // config.stride
     if view.rgb is not None and samples.rgb is not None:
         least, seam = config.min_area / samples.spacing**2, find_seams(view.rgb, samples.grid)
@@ -98,10 +98,10 @@ def segment(
     low = surface.pixels_over(view, -config.clearance, config.clearance, config.margin)
     part, inside = merge_insides(samples, part, low[samples.grid], np.count_nonzero(low) / config.stride**2)
     if odds is not None:
-        part = _with_share(part, juts | (odds[-1][samples.places] > 0.0), 0.5)
+        part = _with_share(part, overhang | (odds[-1][samples.places] > 0.0), 0.5)
     part = merge_occluded(samples, part, config, fit_config, rng)
     # Readings of the surface with a common error exceed the clearance, but not by twice as much.
-    part = _with_share(part, juts | (samples.height > 2.0 * config.clearance), 0.05)
+    part = _with_share(part, overhang | (samples.height > 2.0 * config.clearance), 0.05)
     labels[samples.grid] = image = samples.image(part)
     if view.rgb is not None:
         apart = divided(image, uncut, facing, seam, width)
@@ -122,8 +122,8 @@ def segment(
     return labels, apart
 
 
-def find_jutting(samples: Samples, part: Labels, over: Mask, drop_camera: Array, jump: float) -> Mask:
-    """Find the parts 0 … n that jut out over the edge of a surface.
+def find_overhangs(samples: Samples, part: Labels, over: Mask, drop_camera: Array, jump: float) -> Mask:
+    """Find which of the parts 0 … n hang over the edge of a surface.
 
     They continue one that is over the surface, and are open below. A wall, or something beside the surface,
     goes on below; the edge of the surface hides the lower end of what is behind it.
