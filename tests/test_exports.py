@@ -15,8 +15,9 @@ import trimesh
 import yaml
 import yourdfpy
 from conftest import run_command
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
-from synthetic import shelf_graph
+from synthetic import model_of, shelf_graph, simulated_views
 
 from caryatid.config import ExportConfig
 from caryatid.errors import InputError
@@ -26,6 +27,7 @@ from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.geometry.solids import Polytope, Solid
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.io import graph_text
+from caryatid.sensing.voxel_map import UNKNOWN
 from caryatid.simulation.scenes import load_scene
 from caryatid.viz.colours import object_colour
 
@@ -264,6 +266,34 @@ def test_a_planning_scene_has_the_shapes_of_the_model(tmp_path, with_solid):
                 made = Cylinder(T, radius=sizes[1], height=sizes[0])
         assert made.kind == item.shape.kind
         assert same_shape(item.shape, made.outline())
+
+
+def test_unseen_space_is_one_object_of_boxes_beside_all_that_was_seen():
+    scene = model_of(simulated_views("shelf")[:2])
+    message = planning_scene(scene.graph, allowed={}, voxels=scene.voxels)
+    check_message(message, PLANNING_SCENE)
+    unseen = message["world"]["collision_objects"][-1]
+    assert unseen["id"] == "unseen"
+    voxels, places = scene.voxels, scene.voxels.centres_world(np.argwhere(scene.voxels.hits >= 0))
+    covered = np.zeros(voxels.hits.shape, dtype=int)
+    for primitive, pose in zip(unseen["primitives"], unseen["primitive_poses"], strict=True):
+        away = np.abs(places - pose_of(pose)[:3, 3]) - np.array(primitive["dimensions"]) / 2.0
+        covered += (away < 0.0).all(axis=1).reshape(covered.shape)
+    assert covered.max() == 1, "boxes overlap"
+    bodies = [o.shape for o in scene.graph.objects if o.role == "object"]
+    beside = np.min([shape.signed_distance(places) for shape in bodies], axis=0) > voxels.config.size
+    table, top = scene.graph["o0"].shape, max(shape.outline()[:, 2].max() for shape in bodies)
+    over, height = np.split(
+        transforms.transform(transforms.invert(table.T_world_object), places), [2], axis=1
+    )
+    among = (
+        (np.abs(over) < table.extents[:2] / 2.0).all(axis=1) & (height[:, 0] > 0.03) & (places[:, 2] < top)
+    )
+    unknown = (voxels.states.ravel() == UNKNOWN) & beside & among
+    assert unknown[covered.ravel() > 0].mean() > 0.7
+    assert covered[ndimage.binary_erosion(unknown.reshape(covered.shape), np.ones((5, 5, 5)))].all()
+    names, rows = (message["allowed_collision_matrix"][f"entry_{key}"] for key in ("names", "values"))
+    assert all(rows[names.index("unseen")]["enabled"][names.index(o)] for o in scene.graph)
 
 
 def test_what_supports_an_object_may_touch_it_and_the_robot_keeps_its_own_entries(graph):

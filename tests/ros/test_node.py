@@ -8,8 +8,10 @@ import time
 import pytest
 from action_msgs.msg import GoalStatus
 from conftest import HERE, Process, at_stage, wait_for, within
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.parameter import Parameter
+from visualization_msgs.msg import MarkerArray
 
 pytestmark = pytest.mark.usefixtures("table", "node")
 SUCCEEDED, CANCELED, ABORTED = (
@@ -47,6 +49,26 @@ def test_a_goal_takes_views_and_ends_with_a_graph(client):
     text = "\n".join(log.msg for log in client.logs[logged:])
     for line in ("goal: max_views 3", "view ", "decision: next view at", "goal ended after 3 views: maximum"):
         assert line in text
+
+
+def test_diagnostics_tell_how_the_last_goal_ended_and_markers_are_repeated(client):
+    told, drawn = [], []
+    topics = [
+        client.create_subscription(DiagnosticArray, "/diagnostics", told.append, 10),
+        client.create_subscription(MarkerArray, "/markers", drawn.append, 10),
+    ]
+    assert client.explore(max_views=1, restart=True).result()[0] == SUCCEEDED
+    ended = "idle; the last goal ended: maximum of 1 views reached"
+    wait_for(lambda: any(a.status[0].message == ended for a in told), 3.0, "diagnostics")
+    assert told[-1].status[0].level == DiagnosticStatus.OK
+    client.set_table(topics=ALL[1:])
+    assert client.explore(max_views=1, restart=True).result()[0] == ABORTED
+    wait_for(lambda: told[-1].status[0].level == DiagnosticStatus.ERROR, 3.0, "an error")
+    assert "/camera/depth: no message arrived" in told[-1].status[0].message
+    assert len(drawn) >= 3
+    assert all(marker.lifetime.sec == 3 for marker in drawn[-1].markers)
+    for topic in topics:
+        client.destroy_subscription(topic)
 
 
 @pytest.mark.parametrize("stage", ["adding view 1", "adding view 2", "planning", "waiting for the camera"])
@@ -153,7 +175,7 @@ def test_parameters_are_described_and_read_only_where_they_do_not_change(client)
     results = ask(SetParameters, "set_parameters", request).results
     assert [r.successful for r in results] == [True] + [False] * 5
     assert "out of range" in results[1].reason
-    client.set_parameters("caryatid", {"move_timeout": 5.0})
+    client.set_parameters("caryatid", {"move_timeout": 2.0})
 
 
 def test_a_goal_ends_when_its_client_dies_and_the_next_one_does_not(client):
@@ -170,7 +192,7 @@ def test_a_goal_ends_when_its_client_dies_and_the_next_one_does_not(client):
     assert not goal.done
     goal.cancel()
     goal.result()
-    client.set_parameters("caryatid", {"move_timeout": 5.0})
+    client.set_parameters("caryatid", {"move_timeout": 2.0})
 
 
 @pytest.mark.parametrize("verb", ["order", "removed"])

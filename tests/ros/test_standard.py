@@ -85,8 +85,8 @@ def planner(client):
     found.destroy()
 
 
-def test_moveit_knows_what_is_there_what_may_touch_and_what_is_held(start_node, client, planner):
-    start_node(**GRIPPER)
+def test_moveit_knows_what_is_there_what_may_touch_and_what_is_held(start_ready, client, planner):
+    start_ready(**GRIPPER)
     _, result = client.explore(max_views=1).result()
     wait_for(lambda: planner.scenes == 1)
     objects = {o.id: o for o in result.graph.objects}
@@ -117,10 +117,19 @@ def test_moveit_knows_what_is_there_what_may_touch_and_what_is_held(start_node, 
     assert planner.world.keys() == {o.id for o in client.graphs[-1].objects}
 
 
-def test_without_moveit_the_scene_is_published_all_the_same(start_node, client):
+def test_unseen_space_is_an_obstacle_for_the_gripper_only(start_ready, client, planner):
+    start_ready(**GRIPPER, unseen_space=True)
+    _, result = client.explore(max_views=1).result()
+    wait_for(lambda: planner.scenes == 1)
+    assert planner.world.keys() == {o.id for o in result.graph.objects} | {"unseen"}
+    assert len(planner.world["unseen"].primitives) > 10
+    assert {b for pair in planner.touching if "unseen" in pair for b in pair} == planner.world.keys()
+
+
+def test_without_moveit_the_scene_is_published_all_the_same(start_ready, client):
     scenes = []
     topic = client.create_subscription(PlanningScene, "/elsewhere", scenes.append, 10)
-    start_node(planning_scene="/elsewhere")
+    start_ready(planning_scene="/elsewhere")
     client.explore(max_views=1).result()
     wait_for(lambda: scenes)
     client.destroy_subscription(topic)
@@ -152,8 +161,8 @@ def boxes(client):
     client.destroy_publisher(publisher)
 
 
-def test_boxes_with_names_go_in_and_detections_with_names_come_out(start_node, client, boxes):
-    start_node(masks="boxes:/boxes")
+def test_boxes_with_names_go_in_and_detections_with_names_come_out(start_ready, client, boxes):
+    start_ready(masks="boxes:/boxes")
     status, result = client.explore(max_views=2).result()
     assert (status, result.views) == (GoalStatus.STATUS_SUCCEEDED, 2), result.message
     found = {o.id: o for o in result.graph.objects if o.role == "object"}
@@ -168,14 +177,14 @@ def test_boxes_with_names_go_in_and_detections_with_names_come_out(start_node, c
         assert np.allclose([o.pose.position.x, o.pose.position.y, o.pose.position.z], true, atol=0.01)
 
 
-def test_label_images_are_masks(start_node, client):
+def test_label_images_are_masks(start_ready, client):
     client.set_table(topics=["depth", "colour", "info", "tf", "labels"])
-    start_node(masks="labels:/camera/labels")
+    start_ready(masks="labels:/camera/labels")
     status, result = client.explore(max_views=1).result()
     assert status == GoalStatus.STATUS_SUCCEEDED
     assert len(result.graph.objects) == 1 + len(open_scene("tower")[1].objects)
 
 
-def test_missing_masks_are_named(start_node, client):
-    start_node(masks="labels:/nowhere", image_timeout=1.0)
+def test_missing_masks_are_named(start_ready, client):
+    start_ready(masks="labels:/nowhere", image_timeout=3.0)
     assert "/nowhere: no message arrived" in client.explore(max_views=1).result()[1].message

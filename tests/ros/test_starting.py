@@ -24,10 +24,6 @@ PARAMS = HERE.parents[1] / "ros/caryatid_ros/launch/params.yaml"
             "error: parameter image_timeout: has the wrong type; give a float, such as 5.0",
         ),
         ({"seed": -1}, "error: parameter seed: .*out of range"),
-        (
-            {"move_timeout": 60},
-            "error: parameter move_timeout: has the wrong type; give a float, such as 120.0",
-        ),
         ({"depth_topic": "bad//name"}, "error: .*topic"),
         ({"planner": "best"}, "error: .*best"),
     ],
@@ -43,7 +39,7 @@ def test_a_wrong_parameter_is_one_sentence(start_node, given, said):
 def test_a_parameter_file_holds_for_any_name_and_misspelt_names_are_told(tmp_path):
     file = tmp_path / "params.yaml"
     file.write_text(
-        PARAMS.read_text().replace("move_timeout: 120.0", "move_timeout: 61.0\n    move_timout: 60.0")
+        PARAMS.read_text().replace("move_timeout: 120.0", "move_timeout: 61\n    move_timout: 60.0")
     )
     node = Process(*NODE, "--ros-args", "-r", "__ns:=/lab", "-r", "__node:=eyes", "--params-file", file)
     wait_for(lambda: "move_timeout=61.0" in node.text, 30.0)
@@ -51,8 +47,8 @@ def test_a_parameter_file_holds_for_any_name_and_misspelt_names_are_told(tmp_pat
     node.stop()
 
 
-def test_without_a_clock_a_goal_says_that_time_stands_still(start_node, client):
-    start_node(use_sim_time=True, image_timeout=1.0)
+def test_without_a_clock_a_goal_says_that_time_stands_still(start_ready, client):
+    start_ready(use_sim_time=True, image_timeout=1.0)
     status, result = client.explore(max_views=1).result(20.0)
     assert (status, result.message.partition(";")[0]) == (ABORTED, "ROS time: stands still at 0.000 s")
 
@@ -81,33 +77,32 @@ def test_ctrl_c_while_starting_is_quiet(start_node, wait):
     assert "caryatid" not in node.text.partition("Traceback")[2]
 
 
-def test_a_view_is_taken_only_after_the_camera_has_come_to_rest(start_node, client):
-    client.set_table(motion_time=2.0)
-    start_node(position_tolerance=1.0, angle_tolerance=3.0)
+def test_a_view_is_taken_only_after_the_camera_has_come_to_rest(start_ready, client):
+    client.set_table(motion_time=1.0)
+    start_ready(position_tolerance=1.0, angle_tolerance=3.0)
     goal = client.explore(max_views=2, restart=True)
     wait_for(lambda: goal.feedback, 30.0)
     since = time.time()
     status, result = goal.result()
     stamp = result.graph.header.stamp
     assert status == SUCCEEDED
-    assert stamp.sec + 1e-9 * stamp.nanosec > since + 1.9
+    assert stamp.sec + 1e-9 * stamp.nanosec > since + 0.9
 
 
-def test_depth_may_be_compressed_and_colour_missing(start_node, client):
-    start_node(depth_topic="/camera/depth/compressedDepth", colour_topic="''")
+def test_depth_may_be_compressed_and_colour_missing(start_ready, client):
+    start_ready(depth_topic="/camera/depth/compressedDepth", colour_topic="''")
     status, result = client.explore(max_views=1).result()
     assert status == SUCCEEDED
     assert len(result.graph.supports) >= 3
 
 
-def test_a_leaf_fails_when_the_server_goes(start_node, client):
+def test_a_leaf_fails_when_the_server_goes(start_ready, client):
     pytest.importorskip("py_trees")
     from caryatid_ros import leaves
 
     client.set_table(follow=False)
-    node = start_node()
+    node = start_ready()
     leaf = leaves.Explore(client.action, lambda decision: None)
-    wait_for(lambda: "ready: " in node.text, 60.0)
     assert client.action.wait_for_server(20.0)
     leaf.tick_once()
     at_stage(client, "waiting for the camera")
@@ -118,17 +113,17 @@ def test_a_leaf_fails_when_the_server_goes(start_node, client):
     assert (order.status, order.feedback_message) == (leaves.Status.FAILURE, "there is no service order")
 
 
-def test_a_session_outlives_a_kill(start_node, client, tmp_path):
+def test_a_session_outlives_a_kill(start_ready, client_apart, tmp_path):
     session = str(tmp_path / "scene")
-    node = start_node(session=session)
-    client.explore(max_views=2).result()
-    told = client.call("removed", object="o5")
+    node = start_ready(session=session)
+    client_apart.explore(max_views=2).result()
+    told = client_apart.call("removed", object="o5")
     assert told.success
     node.stop(signal.SIGKILL)
-    known = len(client.graphs)
-    start_node(session=session)
-    wait_for(lambda: len(client.graphs) > known, 30.0)
-    assert {o.id for o in client.graphs[-1].objects} == {o.id for o in told.graph.objects}
-    assert client.call("order", steps=1).success
-    status, result = client.explore(max_views=1).result()
+    known = len(client_apart.graphs)
+    start_ready(session=session)
+    wait_for(lambda: len(client_apart.graphs) > known, 30.0)
+    assert {o.id for o in client_apart.graphs[-1].objects} == {o.id for o in told.graph.objects}
+    assert client_apart.call("order", steps=1).success
+    status, result = client_apart.explore(max_views=1).result()
     assert (status, result.views) == (SUCCEEDED, 1)

@@ -158,7 +158,7 @@ class Exploration:
         if find_spec("vision_msgs") is not None:
             self._publish("detections", messages.detections_message(self._make, scene.graph, self.header))
         if self._planning_scene is not None:
-            self._planning_scene.show(scene.graph, lifted)
+            self._planning_scene.show(scene.graph, scene.voxels, lifted)
 
     def plan(self, refusal: str) -> tuple[Any, str | None]:
         """Plan the next view, or another one if that was refused: its Decision, or why there is none."""

@@ -13,6 +13,7 @@ from typing import Any
 import rclpy
 from action_msgs.msg import GoalInfo, GoalStatus, GoalStatusArray
 from caryatid_msgs.action import Explore
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.qos import qos_profile_action_status_default
 from rclpy.time import Time
@@ -80,7 +81,8 @@ class Goal:
         result.views = self._views
         try:
             log.info(f"goal ended after {self._views} views: {result.message}")
-            node.tell_stage(f"idle; the last goal ended: {result.message}")
+            level = DiagnosticStatus.ERROR if finish == self._handle.abort else DiagnosticStatus.OK
+            node.tell_stage(f"idle; the last goal ended: {result.message}", level)
             node.destroy_publisher(self._status)
             node.goal = None  # before its client knows, who may send the next one
             finish()

@@ -38,6 +38,8 @@ LABELS = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2", "32SC1": "
 """Encodings of label images, and NumPy's type of their pixels."""
 BOX_MARGIN = 0.005
 """How far outside a box its readings may lie [m]: they are on its faces, with noise."""
+LIFETIME = 3
+"""Time after which markers vanish that are not repeated [s]."""
 TEXT_HEIGHT, ARROW_WIDTH = 0.025, 0.012
 """Height of names, and width of the arrow of a certain support [m]."""
 
@@ -240,13 +242,16 @@ def _grasp(make: Make, grasp: Grasp) -> Any:
 def markers_message(make: Make, graph: SupportGraph, header: Any) -> Any:
     """A MarkerArray: shapes in the report's colours, their ids, and an arrow for each support.
 
-    The more probable a support is, the wider is its arrow.
+    The more probable a support is, the wider is its arrow. They have no time, so that RViz draws them where
+    their frame is now.
     """
+    header = make("std_msgs/msg/Header", frame_id=header.frame_id)
 
     def marker(ns: str, kind: int, colour: str, alpha: float, **fields: Any) -> None:
         red, green, blue = (channel / 255.0 for channel in rgb(colour))
         rgba = make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha)
         fields = {"header": header, "ns": ns, "id": len(found), "type": kind, "color": rgba, **fields}
+        fields["lifetime"] = make("builtin_interfaces/msg/Duration", sec=LIFETIME)
         found.append(make("visualization_msgs/msg/Marker", **fields))
 
     found = [make("visualization_msgs/msg/Marker", header=header, action=DELETE_ALL)]

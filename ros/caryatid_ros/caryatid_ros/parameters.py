@@ -41,6 +41,7 @@ class Settings:
     planner: str = _given("support", "planner of the next view")
     robot: str = _given("humanoid", "which views are reachable: humanoid, arm:FILE.npz or module:callable")
     planning_scene: str = _given("", "topic of MoveIt's planning scene, /planning_scene; empty = none")
+    unseen_space: bool = _given(False, "whether that scene holds what no view showed, as boxes that block it")
     gripper_links: str = _given("", "links that touch what is `removed`, the first holds it; empty = none")
     session: str = _given("", "folder that keeps the scene over a restart; empty = none")
     seed: int = _given(0, "of every random choice", high=2**63 - 1)
@@ -77,10 +78,14 @@ def declare_parameters(node: Any) -> None:
     """
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
     from rclpy.exceptions import InvalidParameterTypeException, ParameterException
+    from rclpy.parameter import Parameter
 
     names = [f.name for f in fields(Settings)]
     for f in fields(Settings):
         low, high = f.metadata["range"]
+        given = node._parameter_overrides.get(f.name)  # rclpy has no public list of what was given
+        if isinstance(f.default, float) and given is not None and given.type_ is Parameter.Type.INTEGER:
+            node._parameter_overrides[f.name] = Parameter(f.name, value=float(given.value))
         described = ParameterDescriptor(description=f.metadata["about"])
         if isinstance(f.default, float):
             described.floating_point_range = [FloatingPointRange(from_value=low, to_value=float(high))]
@@ -95,7 +100,7 @@ def declare_parameters(node: Any) -> None:
             raise InputError(f"parameter {f.name}", "has the wrong type", remedy) from None
         except ParameterException as error:
             raise InputError(f"parameter {f.name}", " ".join(str(error).split())) from None
-    for name in node._parameter_overrides:  # rclpy has no public list of what was given
+    for name in node._parameter_overrides:
         if name not in names and name.partition(".")[0] not in OTHERS:
             near = get_close_matches(name, names, 1)
             meant = f"did you mean {near[0]}?" if near else f"known ones: {', '.join(names)}"

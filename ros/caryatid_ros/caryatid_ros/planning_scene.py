@@ -12,6 +12,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from caryatid.exports import planning_scene
 from caryatid.exports.motion import REMOVE, collision_object
 from caryatid.graph import SceneObject, SupportGraph
+from caryatid.sensing.voxel_map import VoxelMap
 from caryatid_ros.messages import Make, message_of
 from caryatid_ros.parameters import Settings
 
@@ -31,16 +32,19 @@ class PlanningSceneTopic:
 
     def __init__(self, node: Any, settings: Settings, qos: Any, make: Make) -> None:
         self._make, self._frame, self._links = make, settings.world_frame, settings.gripper_links.split()
+        self._unseen = settings.unseen_space
         self._topic = node.create_publisher(PlanningScene, settings.planning_scene, qos)
         group = ReentrantCallbackGroup()
         self._service = node.create_client(GetPlanningScene, "get_planning_scene", callback_group=group)
         self._known: set[str] = set()
         self._held = ""
 
-    def show(self, graph: SupportGraph, lifted: SceneObject | None = None) -> None:
+    def show(self, graph: SupportGraph, voxels: VoxelMap | None, lifted: SceneObject | None = None) -> None:
         """Publish the objects, which of them may touch, what is gone, and what the gripper lifted."""
-        message = planning_scene(graph, self._frame, self._allowed())
-        gone = self._known - set(graph)
+        voxels = voxels if self._unseen else None
+        message = planning_scene(graph, self._frame, self._allowed(), voxels)
+        now = {item["id"] for item in message["world"]["collision_objects"]}
+        gone = self._known - now
         attached: list[dict[str, Any]] = []
         if lifted is not None and self._links:
             if self._held:
@@ -51,7 +55,7 @@ class PlanningSceneTopic:
         message["robot_state"]["attached_collision_objects"] = attached
         removed = [{"id": name, "operation": REMOVE} for name in sorted(gone)]
         message["world"]["collision_objects"] += removed
-        self._known = set(graph)
+        self._known = now
         self._topic.publish(message_of(self._make, "moveit_msgs/msg/PlanningScene", message))
 
     def _allowed(self) -> dict[str, Any] | None:

@@ -14,6 +14,7 @@ import rclpy
 from caryatid_msgs.action import Explore
 from caryatid_msgs.msg import Decision, SupportGraph
 from caryatid_msgs.srv import Order, Refused, Removed
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -30,8 +31,13 @@ from caryatid_ros.inbox import Inbox
 from caryatid_ros.messages import make_message, message_type
 from caryatid_ros.parameters import declare_parameters, read_parameters
 
-PUBLISHED = {"support_graph": SupportGraph, "markers": MarkerArray, "stage": String, "decision": Decision}
+PUBLISHED = {
+    "support_graph": SupportGraph, "markers": MarkerArray, "stage": String, "decision": Decision,
+    "/diagnostics": DiagnosticArray,
+}  # fmt: skip
 """Topics, relative to the node's namespace, and their types."""
+BEAT = 1.0
+"""Time between two diagnostics; markers are repeated with them, and vanish with the node [s]."""
 with suppress(ImportError):
     from vision_msgs.msg import Detection3DArray
 
@@ -67,7 +73,9 @@ class ExplorationNode(Node):
         self.failure = ""
         self.goal: Goal | None = None
         # A client that comes late must not drive to the view of an old goal.
-        qos = dict.fromkeys(PUBLISHED, LATCHED) | {"decision": QoSProfile(depth=1)}
+        qos = dict.fromkeys(PUBLISHED, LATCHED) | dict.fromkeys(
+            ("decision", "/diagnostics"), QoSProfile(depth=1)
+        )
         self._topics = {n: self.create_publisher(kind, n, qos[n]) for n, kind in PUBLISHED.items()}
         handler, log = logging.Handler(logging.INFO), self.get_logger()
         handler.emit = lambda record: (  # type: ignore[method-assign]
@@ -80,7 +88,9 @@ class ExplorationNode(Node):
             logging.getLogger(name).addHandler(handler)
         self._planning_scene = self._made_planning_scene() if self.settings.planning_scene else None
         self.scene_thread = ThreadPoolExecutor(1)
+        self._markers: list[Any] = []
         self.tell_stage("starting")
+        self.create_timer(BEAT, self._beat)
         self.prepared = self.scene_thread.submit(self._prepare)
         self._info: Any = None
         info = self._listened["info"][0]
@@ -91,15 +101,17 @@ class ExplorationNode(Node):
         removed = partial(self._answer, self.scene_thread, "remove")
         self.create_service(Removed, "removed", removed, callback_group=group)
         self.create_service(Refused, "refused", self._refused, callback_group=group)
-        self._server = ActionServer(
+        self._server: ActionServer | None = ActionServer(
             self, Explore, "explore", self._execute, callback_group=group,
             goal_callback=self._admit, handle_accepted_callback=self._begin, cancel_callback=self._cancel,
         )  # fmt: skip
 
     def destroy_node(self) -> None:
         """Destroy the node and all that it offers, so that others know at once that it is gone."""
-        self._server.destroy()
-        super().destroy_node()
+        server, self._server = self._server, None
+        if server is not None:  # ROS 2 Kilted has destroyed it where the context ended.
+            server.destroy()
+            super().destroy_node()
 
     def _made_planning_scene(self) -> Any:
         """The topic of MoveIt's planning scene.
@@ -119,10 +131,19 @@ class ExplorationNode(Node):
     def publish(self, name: str, message: Any) -> None:
         """Publish a message under a name of PUBLISHED."""
         self._topics[name].publish(message)
+        self._markers = message.markers[1:] if name == "markers" else self._markers
 
-    def tell_stage(self, text: str) -> None:
-        """Publish what the node does now."""
+    def tell_stage(self, text: str, level: bytes = DiagnosticStatus.OK) -> None:
+        """Publish what the node does now, with a level of its diagnostics."""
         self.publish("stage", String(data=text))
+        self._status = DiagnosticStatus(level=level, name=f"{self.get_name()}: exploration", message=text)
+
+    def _beat(self) -> None:
+        now = DiagnosticArray(status=[self._status])
+        now.header.stamp = self.get_clock().now().to_msg()
+        self.publish("/diagnostics", now)
+        if self._markers:
+            self._topics["markers"].publish(MarkerArray(markers=self._markers))
 
     def sentence(self, error: Exception) -> str:
         """Describe an error in a sentence; the log has the traceback of one that nobody expected."""

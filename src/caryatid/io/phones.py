@@ -6,6 +6,7 @@ z up.
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -251,10 +252,14 @@ def _pose(numbers: Sequence[float], where: str) -> Array:
 def _read_csv(path: Path) -> list[list[str]]:
     """Words of the rows of a CSV file that has any."""
     with read_errors(path, AGAIN):
-        lines = path.read_bytes().decode("utf-8-sig", errors="replace").splitlines()
-    if not lines:
+        lines = path.read_text("utf-8-sig", errors="replace").splitlines()
+    try:
+        rows = [row for row in csv.reader(lines, skipinitialspace=True) if any(row)]
+    except csv.Error as error:
+        raise InputError(path, str(error), AGAIN) from None
+    if not rows:
         raise InputError(path, "is empty", AGAIN)
-    return [[word.strip() for word in line.split(",")] for line in lines if line.strip()]
+    return rows
 
 
 def _numbers(row: list[str], path: Path, count: int) -> list[float]:
