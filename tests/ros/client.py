@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from caryatid_msgs.action import Explore
@@ -12,7 +14,7 @@ from conftest import wait_for
 from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
-from rclpy.executors import MultiThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -32,12 +34,15 @@ class Goal:
         feedback: What came so far.
     """
 
-    def __init__(self, client: ActionClient, request: Any) -> None:
+    def __init__(self, client: Client, request: Any) -> None:
         self.feedback: list[Any] = []
-        self.handle: Any = None
-        sent = client.send_goal_async(request, lambda message: self.feedback.append(message.feedback))
+        self._client = client
+        sent = client.run(partial(client.action.send_goal_async, request, self._take))
         self.handle = wait_for(lambda: sent.done() and sent.result(), what="an answer to the goal")
-        self._result = self.handle.get_result_async() if self.handle.accepted else None
+        self._result = client.run(self.handle.get_result_async) if self.handle.accepted else None
+
+    def _take(self, message: Any) -> None:
+        self.feedback.append(message.feedback)
 
     @property
     def done(self) -> bool:
@@ -51,7 +56,7 @@ class Goal:
 
     def cancel(self, seconds: float = 5.0) -> bool:
         """Cancel it; return whether that was accepted."""
-        answer = self.handle.cancel_goal_async()
+        answer = self._client.run(self.handle.cancel_goal_async)
         wait_for(answer.done, seconds, "an answer to the cancel")
         return len(answer.result().goals_canceling) == 1
 
@@ -84,7 +89,7 @@ class Client(Node):
         self._setters: dict[str, Any] = {}
 
     def __enter__(self) -> Client:
-        self._spinner = MultiThreadedExecutor(num_threads=2, context=self.context)
+        self._spinner = SingleThreadedExecutor(context=self.context)
         self._spinner.add_node(self)
         self._thread = threading.Thread(target=self._spinner.spin, daemon=True)
         self._thread.start()
@@ -95,11 +100,17 @@ class Client(Node):
         self._thread.join(5.0)
         self.destroy_node()
 
+    def run(self, call: Callable[[], Any]) -> Any:
+        """Return the result of a call in the thread that spins: rclpy may lose answers to others."""
+        task = self._spinner.create_task(call)
+        wait_for(task.done)
+        return task.result()
+
     def explore(self, **fields: Any) -> Goal:
         """Send a goal."""
         assert self.action.wait_for_server(20.0), "there is no action server"
         self.stages_seen = len(self.stages)
-        return Goal(self.action, Explore.Goal(**fields))
+        return Goal(self, Explore.Goal(**fields))
 
     def call(self, name: str, seconds: float = 30.0, **fields: Any) -> Any:
         """Call a service, and return its response."""

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar
 
@@ -172,18 +173,27 @@ def client(domain):
 
 
 @pytest.fixture
-def client_apart(monkeypatch):
-    """A client in another domain, with a table of its own: a node that is killed stays in DDS for 20 s."""
+def new_client(monkeypatch):
+    """Make clients in another domain, with a table of its own.
+
+    A node that is killed stays in DDS for 20 s, and those who knew it may send requests to nobody.
+    """
     from client import Client
 
-    number, context = int(os.environ["ROS_DOMAIN_ID"]) + 5, rclpy.Context()
+    number = int(os.environ["ROS_DOMAIN_ID"]) + 5
     monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    rclpy.init(context=context, domain_id=number)
     table = Process(HERE / "table.py")
-    with Client(context) as found:
-        yield found
+
+    @contextmanager
+    def make():
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=number)
+        with Client(context) as client:
+            yield client
+        context.try_shutdown()
+
+    yield make
     table.stop()
-    context.try_shutdown()
 
 
 @pytest.fixture(autouse=True)

@@ -214,7 +214,7 @@ def test_leaves_fail_when_there_is_no_server_and_succeed_with_one(client):
     leaf = leaves.Explore(client.action, went.append, max_views=2, restart=True)
 
     def ended(leaf):
-        leaf.tick_once()
+        client.run(leaf.tick_once)
         return leaf.status not in (leaves.Status.RUNNING, leaves.Status.INVALID)
 
     wait_for(lambda: ended(leaf), 30.0)
@@ -225,7 +225,7 @@ def test_leaves_fail_when_there_is_no_server_and_succeed_with_one(client):
     assert order.response.lifts
     leaf = leaves.Explore(client.action, went.append, restart=True)
     client.set_table(follow=False)
-    leaf.tick_once()
+    client.run(leaf.tick_once)
     at_stage(client, "waiting for the camera")
-    leaf.stop(leaves.Status.INVALID)
+    client.run(lambda: leaf.stop(leaves.Status.INVALID))
     wait_for(lambda: client.stages[-1].endswith("ended: cancelled"), 5.0)

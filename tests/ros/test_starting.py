@@ -104,26 +104,29 @@ def test_a_leaf_fails_when_the_server_goes(start_ready, client):
     node = start_ready()
     leaf = leaves.Explore(client.action, lambda decision: None)
     assert client.action.wait_for_server(20.0)
-    leaf.tick_once()
+    client.run(leaf.tick_once)
     at_stage(client, "waiting for the camera")
     node.stop()
-    wait_for(lambda: leaf.tick_once() or leaf.status == leaves.Status.FAILURE, 5.0, "failure of the leaf")
+    wait_for(
+        lambda: client.run(leaf.tick_once) or leaf.status == leaves.Status.FAILURE, 5.0, "failure of the leaf"
+    )
     order = leaves.order(client.service_clients["order"])
-    order.tick_once()
+    client.run(order.tick_once)
     assert (order.status, order.feedback_message) == (leaves.Status.FAILURE, "there is no service order")
 
 
-def test_a_session_outlives_a_kill(start_ready, client_apart, tmp_path):
+def test_a_session_outlives_a_kill(start_ready, new_client, tmp_path):
     session = str(tmp_path / "scene")
     node = start_ready(session=session)
-    client_apart.explore(max_views=2).result()
-    told = client_apart.call("removed", object="o5")
+    with new_client() as client:
+        client.explore(max_views=2).result()
+        told = client.call("removed", object="o5")
     assert told.success
     node.stop(signal.SIGKILL)
-    known = len(client_apart.graphs)
     start_ready(session=session)
-    wait_for(lambda: len(client_apart.graphs) > known, 30.0)
-    assert {o.id for o in client_apart.graphs[-1].objects} == {o.id for o in told.graph.objects}
-    assert client_apart.call("order", steps=1).success
-    status, result = client_apart.explore(max_views=1).result()
+    with new_client() as client:
+        graph = wait_for(lambda: client.graphs, 30.0)[-1]
+        assert {o.id for o in graph.objects} == {o.id for o in told.graph.objects}
+        assert client.call("order", steps=1).success
+        status, result = client.explore(max_views=1).result()
     assert (status, result.views) == (SUCCEEDED, 1)

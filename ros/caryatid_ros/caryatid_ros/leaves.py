@@ -1,7 +1,8 @@
 """Leaves of a py_trees behaviour tree, one for each verb: `Explore`, `order` and `removed`.
 
-They take the clients of an rclpy node, which must spin while the tree ticks, and call them asynchronously.
-They fail if there is no server, or if it goes away.
+They take the clients of an rclpy node, and call them asynchronously. Tick the tree in the thread that spins
+the node, such as in a timer: from another one, rclpy may lose the answer to a goal. They fail if there is no
+server, or if it goes away.
 """
 
 from __future__ import annotations
