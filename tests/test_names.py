@@ -14,7 +14,7 @@ from test_service import body, serving
 from caryatid.exports import export_graph
 from caryatid.graph import Support, SupportGraph
 from caryatid.io import graph_from_json, graph_to_json
-from caryatid.io.bop import read_recording
+from caryatid.io.bop import read_recording, write_recording
 from caryatid.io.images import png
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
@@ -35,6 +35,8 @@ def test_objects_of_a_recording_have_the_names_of_their_labels(tmp_path, recordi
     (recording / "names.json").write_text(json.dumps({"1": "mug", "2": "two\nlines", "9": "ghost"}))
     assert names_of_run(recording, tmp_path / "run") == {"o1": "mug", "o2": "two lines"}
     assert "name" not in before
+    write_recording(tmp_path / "copy", read_recording(recording))
+    assert json.loads((tmp_path / "copy/names.json").read_text()) == {"1": "mug", "2": "two lines"}
     assert "mug (o1)" in (tmp_path / "run/report.html").read_text()
     capsys.readouterr()
     assert run_command("describe", tmp_path / "run") == 0

@@ -131,7 +131,7 @@ def write_recording(folder: str | Path, views: Iterable[View]) -> None:
     Args:
         folder: The folder; must not exist, or be empty.
         views: In frame order. Labels become one mask each and `obj_id` = label. Those of segments have no
-            scene_gt.json, because they name no objects.
+            scene_gt.json and no names, because they name no objects.
 
     Raises:
         InputError: No views, or the folder cannot be written.
@@ -147,7 +147,7 @@ def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
         InputError: No views, the folder's place is taken, or the disk cannot be written.
     """
     cameras: dict[str, Any] = {}
-    objects: dict[str, Any] = {}
+    objects, names = dict[str, Any](), dict[int, str]()
     are_segments = False
     for index, view in enumerate(views):
         depth_scale = 0.1
@@ -167,6 +167,7 @@ def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
             are_segments |= view.labels_are == "segments"
             present = [int(k) for k in np.unique(view.labels) if k > 0]
             objects[str(index)] = [{"obj_id": k} for k in present]
+            names |= {k: name for k, name in (view.names or {}).items() if k in present}
             for order, label in enumerate(present):
                 mask = np.where(view.labels == label, np.uint8(255), np.uint8(0))
                 folder.write(f"mask_visib/{index:06d}_{order:06d}.png", images.png(mask))
@@ -175,6 +176,8 @@ def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
     folder.write("scene_camera.json", json_text(cameras).encode())
     if objects and not are_segments:
         folder.write("scene_gt.json", json_text(objects).encode())
+        if names:
+            folder.write("names.json", json_text({str(k): name for k, name in names.items()}).encode())
     folder.publish()
 
 
