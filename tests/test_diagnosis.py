@@ -66,6 +66,17 @@ def test_a_fault_is_named_with_its_remedy(sound, said):
     assert any(re.search(said, problem) for problem in problems), problems
 
 
+def test_the_report_says_what_is_wrong_above_the_pictures(sound, tmp_path, capsys):
+    write_recording(tmp_path / "spoilt", [FAULTS["is the inverse"](view) for view in sound])
+    assert run_command("check", tmp_path / "spoilt", "--report", tmp_path / "check.html") == 1
+    assert capsys.readouterr().out.count("wrong: ") == 1
+    page = (tmp_path / "check.html").read_text()
+    assert page.index("is the inverse, world to camera") < page.index("<svg")
+    assert page.count("<figure") == len(sound) + 2
+    assert run_command("check", "sample-cloud") == 1
+    assert "run `caryatid extract`" in capsys.readouterr().err
+
+
 def test_a_wall_larger_than_the_table_is_no_fault():
     behind = (np.array([-0.4, 0.0, TABLE + 0.5]), np.array([0.02, 3.0, 1.5]))
     view = table_scene(from_the_side(0.0, 20.0), [behind])

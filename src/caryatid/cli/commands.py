@@ -198,10 +198,13 @@ class Check(options.Command, work="results:check_views"):
 
     Usage examples:
       caryatid check recording/
+      caryatid check recording/ --report check.html
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """Recording: a folder in the BOP or TUM RGB-D format, or of a phone; import bags first."""
+    report: Annotated[Path | None, options.shown("FILE.html")] = None
+    """Also write a page with pictures of up to 12 views, and of all of them together."""
     settings: options.Settings = options.Settings()
 
 

@@ -29,14 +29,17 @@ from caryatid.manipulation.order import plan_order
 from caryatid.runtime import fingerprint
 from caryatid.runtime.parallel import cores
 from caryatid.segmentation.diagnosis import diagnose
-from caryatid.sources import open_run, read_model
+from caryatid.sources import kind_of, open_run, read_model
 from caryatid.steps import read_config, read_steps
+from caryatid.viz.check_report import SHOWN, make_check_report
 from caryatid.viz.report import make_report, print_pdf, read_lift, render_html
-from caryatid.viz.tables import census, count_of, describe, order_line, order_table
+from caryatid.viz.tables import Table, census, count_of, describe, order_line, order_table
 
 
 def check_views(command: Check) -> int:
     config, source = command.settings.read(), command.source
+    if kind_of(str(source)) == "cloud":
+        raise InputError(source, "is a cloud", "run `caryatid extract`, which checks its unit and its frame")
     dataset = open_dataset(source, config.recording)
     with command.output.working("looking"):
         found = diagnose(dataset, config)
@@ -54,6 +57,13 @@ def check_views(command: Check) -> int:
         ])  # fmt: skip
     said = "".join(f"wrong: {problem}\n" for problem in found.problems) or "nothing is wrong\n"
     shown = table(f"{source}: {count_of(len(rows), 'view')}", [*columns.values()], rows, figures=True)
+    if command.report is not None:
+        known = {view["view"] for view in found.views}
+        frames = [frame for frame in dataset.frames if frame.name in known]
+        views = [frame.load() for frame in frames[:: -(-len(frames) // SHOWN) or 1]]
+        numbers = Table.of("Views", (name.replace("\n", " ") for name in columns.values()), rows)
+        page = make_check_report(source.name, found, views, numbers, config.cloud)
+        write_file(command.report, render_html(page).encode())
     command.output.result({"views": found.views, "problems": found.problems}, shown, said)
     return 1 if found.problems else 0
 

@@ -134,6 +134,16 @@ class ImagePlane:
     affine: Array
     share: float
 
+    def excess(self, view: View) -> Array:
+        """How much farther (H, W) each pixel of the image is than it, relative to it [1]; −1 = no reading."""
+        v, u = np.indices(view.depth.shape)
+        inverse: Array = u * self.affine[0] + v * self.affine[1] + self.affine[2]
+        return inverse * view.depth - 1.0
+
+    def mask(self, view: View) -> NDArray[np.bool_]:
+        """Which pixels (H, W) of the image lie on it, with twice the usual noise."""
+        return np.abs(self.excess(view)) < 2.0 * FLAT
+
     def normal_camera(self, K: Array) -> Array:
         """Its unit normal (3,) towards the camera, if the pinhole matrix is K (3, 3) [px]."""
         return -transforms.unit(self.affine @ K)
@@ -357,13 +367,10 @@ class _RaisedPoints:
 
     @classmethod
     def of(cls, view: View) -> _RaisedPoints:
-        plane, index = find_image_plane(view), np.flatnonzero(view.valid)
-        v, u = np.divmod(index, view.depth.shape[1])
-        pixels, z = np.stack([u, v, np.ones(len(u))]), view.depth.ravel()[index].astype(np.float64)
-        above = np.flatnonzero(plane.affine @ pixels * z < 1.0 - 4.0 * FLAT)
+        plane = find_image_plane(view)
+        above = np.flatnonzero(view.valid & (plane.excess(view) < -4.0 * FLAT))
         above = above[:: max(1, len(above) // SAMPLES)] if plane.share >= LARGE else above[:0]
-        points = (np.linalg.inv(view.K) @ pixels[:, above] * z[above]).T
-        return cls(plane.normal_camera(view.K), points)
+        return cls(plane.normal_camera(view.K), view.points_camera.reshape(-1, 3)[above])
 
     def points_world(self, T_world_camera: Array, max_tilt: float) -> Array:
         """The points (N, 3) [m] from a pose (4, 4), if the plane is then tilted by at most so much [deg]."""
@@ -442,7 +449,7 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
     problems = [texts[0] for texts in found.values() if 2 * len(texts) > len(rows)]
     if len(thin) > 1:
         best = _best_reading(_overlaps(thin, max_tilt))
-        problems += [best] if best and best not in problems else []
+        problems = [p for p in problems if not best or best not in p] + ([best] if best else [])
     return Diagnosis(rows, problems)
 
 
@@ -452,13 +459,7 @@ def _is_level_somewhere(view: View, max_tilt: float) -> bool:
         plane = find_image_plane(view)
         if plane.share == 0.0 or _tilt(view.pose, plane.normal_camera(view.K)) <= max_tilt:
             return plane.share > 0.0
-        v, u = np.indices(view.depth.shape)
-        off = np.abs(
-            plane.affine @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1) * view.depth.ravel() - 1.0
-        )
-        view = replace(
-            view, depth=np.where(off.reshape(view.depth.shape) < 2.0 * FLAT, np.float32(0.0), view.depth)
-        )
+        view = replace(view, depth=np.where(plane.mask(view), np.float32(0.0), view.depth))
     return False
 
 

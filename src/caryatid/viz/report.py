@@ -120,11 +120,13 @@ class Report:
         title: Heading.
         about: Conditions, version and date of the run.
         sections: Answer, what is doubtful, how it went, removal, and folded: tables, views, settings.
+        of_run: Whether it has shapes and segments.
     """
 
     title: str
     about: str
     sections: Sequence[Section]
+    of_run: bool = True
 
 
 def make_report(
