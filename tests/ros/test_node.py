@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import time
 
@@ -137,10 +138,19 @@ def test_a_second_goal_is_rejected_and_hands_are_checked(client):
     at_stage(client, "waiting for the camera")
     assert not within(0.5, client.explore).handle.accepted
     assert "hands: 7 is neither 1 nor 2" in client.call("order", hands=7).message
-    client.set_table(topics=ALL[:2])
+    client.set_table(topics=["tf"])
     status, result = goal.result(10.0)
     assert status == ABORTED
     assert "mm and " in result.message
+
+
+def test_transforms_that_stop_are_told_while_the_camera_is_awaited(client):
+    goal = client.explore(restart=True)
+    wait_for(lambda: goal.feedback, 30.0)
+    client.set_table(topics=ALL[:3], follow=False)
+    status, result = goal.result(10.0)
+    assert status == ABORTED
+    assert re.match(r"transform map ← camera_optical: is \d\.\d s old", result.message)
 
 
 def test_a_late_client_gets_no_old_decision_but_the_graph(client):

@@ -115,6 +115,7 @@ def test_moveit_knows_what_is_there_what_may_touch_and_what_is_held(start_ready,
     client.explore(max_views=1, restart=True).result()
     wait_for(lambda: planner.scenes == 4)
     assert planner.world.keys() == {o.id for o in client.graphs[-1].objects}
+    assert not planner.held
 
 
 def test_unseen_space_is_an_obstacle_for_the_gripper_only(start_ready, client, planner):

@@ -26,6 +26,9 @@ PARAMS = HERE.parents[1] / "ros/caryatid_ros/launch/params.yaml"
         ({"seed": -1}, "error: parameter seed: .*out of range"),
         ({"depth_topic": "bad//name"}, "error: .*topic"),
         ({"planner": "best"}, "error: .*best"),
+        ({"depth_topic": "''"}, "error: parameter depth_topic: is empty"),
+        ({"info_topic": "/camera/depth"}, "error: parameters: two of them name the topic /camera/depth"),
+        ({"masks": "label:/t"}, "error: parameter masks: has the kind 'label'; give onnx:FILE, labels:TOPIC"),
     ],
 )
 def test_a_wrong_parameter_is_one_sentence(start_node, given, said):

@@ -92,19 +92,21 @@ class Exploration:
             robot=self._robot, planner=self._settings.planner, config=self._config,
             seed=self._settings.seed, goal=goal.goal or None, until=goal.until or None,
         )  # fmt: skip
-        before, self._explorer = self._explorer, explorer
         if not goal.restart:
-            explorer.step = before.step
+            explorer.step, self._explorer = self._explorer.step, explorer
             self._replace(self.scene)
             return self.graph
         if self._session is not None:
             folder, number = Path(self._settings.session), 1
-            self._session.close()
             while (aside := folder.with_name(f"{folder.name}.{number}")).exists():
                 number += 1
             folder.rename(aside)
             log.info("%s: the earlier session is now %s", folder, aside)
+            self._session.close()
             self._session = self._opened()
+        self._explorer = explorer
+        if self._planning_scene is not None:
+            self._planning_scene.release()
         self.graph = self._make("caryatid_msgs/msg/SupportGraph")
         self._replace(explorer.scene)
         return self.graph

@@ -20,7 +20,7 @@ from rclpy.time import Time
 from tf2_ros import TransformException
 
 from caryatid.errors import InputError
-from caryatid_ros.inbox import Inbox
+from caryatid_ros.inbox import Inbox, seconds_of
 from caryatid_ros.parameters import read_parameters
 
 POLL = 0.05
@@ -29,6 +29,8 @@ STILL = 0.2
 """Time before a view in which the camera must not have moved [s]."""
 BEAT, SILENT = 0.5, 3.5
 """Time between two signs of life that the client must acknowledge, and how long it may not do so [s]."""
+OLD = 1.0
+"""Age of a transform that no longer says where the camera is, and longest step of a clock that counts [s]."""
 CANCELLED = "cancelled"
 """Why a goal ended that its client cancelled."""
 
@@ -137,6 +139,10 @@ class Goal:
         distance, angle = _between(there.translation, there.rotation, pose.position, pose.orientation)
         if distance <= s.position_tolerance and angle <= s.angle_tolerance:
             return True
+        if (age := self._age(self._frame)) > OLD:
+            reason = f"is {age:.1f} s old, so that nobody knows where the camera is"
+            source = f"transform {s.world_frame} ← {self._frame}"
+            return InputError(source, reason, "check what publishes it, and its clock")
         reason = (
             f"is {1e3 * distance:.1f} mm and {angle:.4f} rad from the next view after {s.move_timeout:g} s; "
             f"the tolerances are {1e3 * s.position_tolerance:g} mm and {s.angle_tolerance:g} rad"
@@ -188,6 +194,11 @@ class Goal:
         remedy = "publish it in tf, or set world_frame"
         return InputError(f"transform {world} ← {frame}", f"is unknown{at} ({error})", remedy)
 
+    def _age(self, frame: str) -> float:
+        """Age of the newest transform world ← frame [s]; 0 if it is static."""
+        newest = self._buffer.lookup_transform(self._settings.world_frame, frame, Time(), Duration()).header
+        return self._now() - seconds_of(newest.stamp) if seconds_of(newest.stamp) > 0.0 else 0.0
+
     def _now(self) -> float:
         return float(1e-9 * self._node.get_clock().now().nanoseconds)
 
@@ -218,7 +229,8 @@ class Goal:
             if found is not None and not isinstance(found, InputError):
                 return found
             if now != before:
-                waited, before, moved = waited + max(now - before, 0.0), now, time.monotonic()
+                passed = min(max(now - before, 0.0), OLD)  # a clock that was set tells nothing
+                waited, before, moved = waited + passed, now, time.monotonic()
             if time.monotonic() - moved > seconds:
                 remedy = "publish /clock, or set use_sim_time to false"
                 raise InputError("ROS time", f"stands still at {now:.3f} s", remedy)
@@ -238,7 +250,8 @@ class Goal:
         """Whether the client receives messages of the goal's status, which are repeated for this purpose.
 
         DDS notices only after 20 s that a process was killed, and until then, none of the messages counts as
-        acknowledged. So silence counts only after an acknowledgement during this goal.
+        acknowledged. So silence counts only after an acknowledgement during this goal. It may be that of
+        another client, which nobody can tell: a robot that stops without need does less harm.
         """
         now, watched = time.monotonic(), self._watched
         if now - self._beat < BEAT:

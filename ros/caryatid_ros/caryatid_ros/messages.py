@@ -131,6 +131,9 @@ def with_masks(view: View, masks: Any, frames: Mapping[str, Array]) -> View:
             reason = f"have the encoding '{masks.encoding}'"
             raise InputError("masks", reason, f"publish them as {', '.join(LABELS)}")
         pixels = np.frombuffer(masks.data, ">" + kind if masks.is_bigendian else kind)
+        if len(pixels) < masks.height * masks.width or len(pixels) % max(masks.height, 1):
+            reason = f"have {len(pixels)} pixels instead of {masks.width} × {masks.height}"
+            raise InputError("masks", reason, "check the node that publishes them")
         labels = pixels.reshape(masks.height, -1)[:, : masks.width].astype(np.int32)
         return replace(view, labels=labels, labels_are="segments", names=None)
     if masks.header.frame_id not in frames:
@@ -142,6 +145,9 @@ def with_masks(view: View, masks: Any, frames: Mapping[str, Array]) -> View:
         box, size = detection.bbox.center, detection.bbox.size
         T = frames[masks.header.frame_id] @ matrix_of(box.orientation, box.position, "masks")
         half = np.array([size.x, size.y, size.z]) / 2.0 + BOX_MARGIN
+        if not (half > BOX_MARGIN).all():
+            reason = f"have a box of {size.x:g} × {size.y:g} × {size.z:g} m"
+            raise InputError("masks", reason, "check the node that publishes them")
         points = transforms.transform(transforms.invert(T) @ view.pose, view.points_camera)
         share = np.abs(points / half).max(axis=-1)
         labels[share < inside] = label

@@ -10,13 +10,16 @@ import sys
 def main() -> None:
     """Run the node until it is stopped; no exception in a callback ends it."""
     node, status = None, 0
+    # Ctrl-C during imports must be as quiet as later; extension modules turn it into errors of their own.
+    before = signal.signal(signal.SIGINT, lambda *_: os._exit(0))
     try:
-        import rclpy  # Ctrl-C while this and what it needs is imported must be as quiet as later
+        import rclpy
         from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
         from caryatid.errors import CaryatidError, in_one_line
         from caryatid_ros.server import ExplorationNode
 
+        signal.signal(signal.SIGINT, before)
         rclpy.init()
         try:
             node = ExplorationNode()

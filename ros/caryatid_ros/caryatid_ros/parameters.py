@@ -65,6 +65,23 @@ class Settings:
         return found | ({"masks": (topic, MASKS[kind])} if kind in MASKS else {})
 
 
+def check_parameters(settings: Settings) -> None:
+    """Reject topics that are missing or the same, and masks of another kind.
+
+    Raises:
+        InputError: The first parameter that cannot be used.
+    """
+    kind, colon, _ = settings.masks.partition(":")
+    if colon and kind not in (*MASKS, "onnx"):
+        remedy = "give onnx:FILE, labels:TOPIC or boxes:TOPIC"
+        raise InputError("parameter masks", f"has the kind '{kind}'", remedy)
+    if not settings.depth_topic:
+        raise InputError("parameter depth_topic", "is empty", "give the topic of depth images")
+    names = [topic for topic, _ in settings.topics.values()]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise InputError("parameters", f"two of them name the topic {min(twice)}", "give each its own topic")
+
+
 def _image_type(topic: str) -> str:
     packed = topic.endswith(("/compressed", "/compressedDepth"))
     return "sensor_msgs/msg/CompressedImage" if packed else "sensor_msgs/msg/Image"

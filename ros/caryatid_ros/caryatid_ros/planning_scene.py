@@ -37,19 +37,22 @@ class PlanningSceneTopic:
         group = ReentrantCallbackGroup()
         self._service = node.create_client(GetPlanningScene, "get_planning_scene", callback_group=group)
         self._known: set[str] = set()
-        self._held = ""
+        self._held, self._released = "", False
 
     def show(self, graph: SupportGraph, voxels: VoxelMap | None, lifted: SceneObject | None = None) -> None:
         """Publish the objects, which of them may touch, what is gone, and what the gripper lifted."""
         voxels = voxels if self._unseen else None
         message = planning_scene(graph, self._frame, self._allowed(), voxels)
         now = {item["id"] for item in message["world"]["collision_objects"]}
-        gone = self._known - now
-        attached: list[dict[str, Any]] = []
-        if lifted is not None and self._links:
-            if self._held:
-                attached.append({"object": {"id": self._held, "operation": REMOVE}})
-            gone = (gone | {self._held} - {""}) - {lifted.id}
+        gone, attached = self._known - now, list[dict[str, Any]]()
+        lifts = lifted is not None and bool(self._links)
+        if self._held and (lifts or self._released):  # MoveIt puts back into the world what it detaches
+            attached.append({"object": {"id": self._held, "operation": REMOVE}})
+            gone |= {self._held} - now
+            self._held = ""
+        self._released = False
+        if lifted is not None and lifts:
+            gone.discard(lifted.id)
             self._held, body = lifted.id, collision_object(lifted, self._frame)
             attached.append({"object": body, "link_name": self._links[0], "touch_links": self._links})
         message["robot_state"]["attached_collision_objects"] = attached
@@ -57,6 +60,10 @@ class PlanningSceneTopic:
         message["world"]["collision_objects"] += removed
         self._known = now
         self._topic.publish(message_of(self._make, "moveit_msgs/msg/PlanningScene", message))
+
+    def release(self) -> None:
+        """Detach with the next graph what the gripper holds: another scene begins, whose ids begin anew."""
+        self._released = True
 
     def _allowed(self) -> dict[str, Any] | None:
         """The present matrix of allowed collisions, or None if MoveIt does not answer."""

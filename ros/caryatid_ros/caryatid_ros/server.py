@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import traceback
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -29,13 +30,17 @@ from caryatid.errors import CaryatidError, InputError, in_one_line
 from caryatid_ros.goal import CANCELLED, Goal
 from caryatid_ros.inbox import Inbox
 from caryatid_ros.messages import make_message, message_type
-from caryatid_ros.parameters import declare_parameters, read_parameters
+from caryatid_ros.parameters import check_parameters, declare_parameters, read_parameters
 
 PUBLISHED = {
     "support_graph": SupportGraph, "markers": MarkerArray, "stage": String, "decision": Decision,
     "/diagnostics": DiagnosticArray,
 }  # fmt: skip
 """Topics, relative to the node's namespace, and their types."""
+COMMANDS = re.compile(
+    r" \(on the command line: [^)]*\)|,? or for a recording (add )?--set \S+| or use --level"
+)
+"""Remedies for the command line."""
 BEAT = 1.0
 """Time between two diagnostics; markers are repeated with them, and vanish with the node [s]."""
 with suppress(ImportError):
@@ -65,9 +70,14 @@ class ExplorationNode(Node):
         super().__init__("caryatid")
         declare_parameters(self)
         self.settings = read_parameters(self)
+        check_parameters(self.settings)
         try:
             topics = self.settings.topics.items()
-            self._listened = {what: (self.resolve_topic_name(topic), kind) for what, (topic, kind) in topics}
+            self._listened = {
+                what: (self.resolve_topic_name(topic), message_type(kind)) for what, (topic, kind) in topics
+            }
+        except ImportError as error:
+            raise InputError("parameter masks", f"needs messages ({error})", "install vision_msgs") from None
         except RuntimeError as error:  # of the middleware
             raise InputError("parameters", " ".join(str(error).split()), "correct the topic") from None
         self.failure = ""
@@ -147,11 +157,10 @@ class ExplorationNode(Node):
 
     def sentence(self, error: Exception) -> str:
         """Describe an error in a sentence; the log has the traceback of one that nobody expected."""
-        if isinstance(error, InputError) and "--" in error.remedy:  # that is for the command line
-            remedy = "check world_frame (level, z up) and the images' frame (x right, y down, z forward)"
-            error = InputError(error.source, error.reason, remedy)
         if isinstance(error, (CaryatidError, OSError, MemoryError)):
-            return in_one_line(error)
+            said = in_one_line(error)
+            told = COMMANDS.sub("", said)
+            return told if told == said else f"{told}; check world_frame and the images' frame"
         if not rclpy.ok():
             return "the node was stopped"
         self.get_logger().error("".join(traceback.format_exception(error)))
@@ -217,26 +226,35 @@ class ExplorationNode(Node):
         return GoalResponse.REJECT
 
     def _begin(self, handle: Any) -> None:
+        before = set(self.subscriptions)
+        try:
+            self._listen(handle)
+        finally:  # a goal that cannot begin is aborted, and the error is logged
+            self._heard = set(self.subscriptions) - before
+            handle.execute()
+
+    def _listen(self, handle: Any) -> None:
         """Listen to the camera for the new goal only, because images and transforms cost time."""
-        before, buffer = set(self.subscriptions), Buffer()
+        buffer = Buffer()
         inbox = Inbox({what: topic for what, (topic, _) in self._listened.items()}, self._info)
         self._listener = TransformListener(buffer, self)
         for what, (topic, kind) in self._listened.items():
             if what != "info":
                 put = partial(inbox.put, what)
-                self.create_subscription(message_type(kind), topic, put, qos_profile_sensor_data)
+                self.create_subscription(kind, topic, put, qos_profile_sensor_data)
         info = self._listened["info"][0]
         for publisher in self.get_publishers_info_by_topic(info):
             if publisher.qos_profile.durability == LATCHED.durability:  # it may have published before we came
                 self.create_subscription(CameraInfo, info, self._take_info, LATCHED)
         self.goal = Goal(self, handle, inbox, buffer)
-        self._heard = set(self.subscriptions) - before
-        handle.execute()
 
     async def _execute(self, handle: Any) -> Any:
         done, goal, heard = self._future(), self.goal, self._heard
-        assert goal is not None
-        Thread(target=lambda: done.set_result(goal.run()), daemon=True).start()
+        if goal is None:
+            handle.abort()
+            done.set_result(Explore.Result(message="internal error; the node's log has the traceback"))
+        else:
+            Thread(target=lambda: done.set_result(goal.run()), daemon=True).start()
         await done
         for subscription in heard:
             self.destroy_subscription(subscription)
