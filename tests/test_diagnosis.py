@@ -46,7 +46,7 @@ FAULTS = {
     "camera's body .*recording.axes=body": posed(lambda T: T @ BODY.T),
     "is the inverse": posed(transforms.invert),
     "y axis points up.*--level": posed(lambda T: Y_UP.T @ T),
-    "translation of T_world_camera in millimetres": posed(
+    "as long as depth says, as if in millimetres": posed(
         lambda T: transforms.rigid(T[:3, :3], 1e3 * T[:3, 3])
     ),
     "mirrored": lambda v: replace(v, depth=v.depth[:, ::-1].copy(), rgb=None, labels=None),
@@ -83,6 +83,29 @@ def test_a_wall_larger_than_the_table_is_no_fault():
     found = diagnose([view], Config())
     assert found.views[0]["tilt"] > 80.0
     assert found.problems == []
+
+
+@pytest.mark.parametrize("factor", [5.0, 0.2, 39.37])
+def test_units_that_do_not_fit_are_told_as_a_ratio(sound, factor):
+    spoilt = [replace(view, depth=np.float32(factor) * view.depth) for view in sound]
+    problems = diagnose(spoilt, Config()).problems
+    assert any(f"is {1 / factor:.4g} times as long" in p or "as if in centimetres" in p for p in problems)
+
+
+def test_what_cannot_be_judged_is_not_called_right(sound):
+    moved = [v.with_pose(transforms.rigid(np.eye(3), (n % 2, 0, 0)) @ v.pose) for n, v in enumerate(sound)]
+    found = diagnose(moved, Config())
+    assert not found.problems
+    assert found.doubts[0].startswith("poses, because consecutive views share only")
+    noise = np.random.default_rng(0).uniform(0.5, 3.0, sound[0].depth.shape).astype(np.float32)
+    found = diagnose([replace(sound[0], depth=noise)], Config())
+    assert found.doubts[0].startswith("depth and axes, because most views show no plane")
+
+
+def test_a_part_of_an_image_is_no_fault(sound):
+    K = sound[0].K - [[0.0, 0.0, 100.0], [0.0, 0.0, 70.0], [0.0, 0.0, 0.0]]
+    part = replace(sound[0], depth=sound[0].depth[70:, 100:].copy(), K=K, rgb=None, labels=None)
+    assert diagnose([part], Config()).problems == []
 
 
 def test_a_principal_point_outside_the_image_is_said(sound):

@@ -220,7 +220,7 @@ def test_label_images_are_masks(views, encoding, kind):
     with pytest.raises(InputError, match="masks: have the encoding 'rgb8'"):
         messages.with_masks(views[0], image(views[0].rgb, "rgb8"), {})
     message.data = bytes(message.data)[:-64]
-    with pytest.raises(InputError, match="masks: have [0-9]+ pixels instead of"):
+    with pytest.raises(InputError, match=r"masks: have \d+ pixels instead of"):
         messages.with_masks(views[0], message, {})
 
 
@@ -246,7 +246,7 @@ def test_boxes_are_masks_of_what_they_hold_in_either_frame(views):
     inside = view.valid & (np.abs(points) <= 0.1 + messages.BOX_MARGIN).all(axis=-1)
     np.testing.assert_array_equal(masked["map"].labels == 1, inside)
     size.x = float("nan")
-    with pytest.raises(InputError, match="masks: have a box of nan × 0.2 × 0.2 m"):
+    with pytest.raises(InputError, match=r"masks: have a box of nan × 0\.2 × 0\.2 m"):
         messages.with_masks(view, boxes, frames)
     header = SimpleNamespace(frame_id="odom")
     with pytest.raises(InputError, match="masks: have the frame 'odom'; publish them in map or lens"):

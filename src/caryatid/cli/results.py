@@ -55,7 +55,9 @@ def check_views(command: Check) -> int:
             f"{view['field_of_view']:.0f}", f"{view['readings']:.0%}", f"{view['near']:.2f}",
             f"{view['far']:.2f}", f"{view['plane']:.0%}", tilt,
         ])  # fmt: skip
-    said = "".join(f"wrong: {problem}\n" for problem in found.problems) or "nothing is wrong\n"
+    said = "".join(f"wrong: {problem}\n" for problem in found.problems)
+    said += "".join(f"not confirmed: {doubt}\n" for doubt in found.doubts)
+    said += "" if said else "nothing is wrong\n"
     shown = table(f"{source}: {count_of(len(rows), 'view')}", [*columns.values()], rows, figures=True)
     if command.report is not None:
         known = {view["view"] for view in found.views}
@@ -64,7 +66,9 @@ def check_views(command: Check) -> int:
         numbers = Table.of("Views", (name.replace("\n", " ") for name in columns.values()), rows)
         page = make_check_report(source.name, found, views, numbers, config.cloud)
         write_file(command.report, render_html(page).encode())
-    command.output.result({"views": found.views, "problems": found.problems}, shown, said)
+    command.output.result(
+        {"views": found.views, "problems": found.problems, "doubts": found.doubts}, shown, said
+    )
     return 1 if found.problems else 0
 
 

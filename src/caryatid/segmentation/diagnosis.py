@@ -43,7 +43,7 @@ BUFFER = 0.8
 OFF_CENTRE = 0.2
 """How far the principal point may be from the image's middle [image widths and heights]."""
 NEAR = 0.015
-"""Distance of the same point in two views [m]; poses are off by about 1 cm."""
+"""Distance of the same point in two views, relative to the reading [1]; poses are off by about 1 cm."""
 LEAST = 20
 """Minimum number of points above the table that tell whether two views show the same [1]."""
 
@@ -91,6 +91,9 @@ POSES: Mapping[str, Callable[[Array], Array]] = {
     GL_AXES: lambda T: T @ GL,
     BODY_AXES: lambda T: T @ BODY,
     "T_world_camera is the inverse, world to camera: invert it": transforms.invert,
+    f"T_world_camera is the inverse, world to camera: invert it; and {GL_AXES}": lambda T: (
+        transforms.invert(T) @ GL
+    ),
     f"the world's y axis points up: {Z_UP}": lambda T: Y_UP @ T,
     f"{GL_AXES}, and the world's y axis points up: {Z_UP}": lambda T: Y_UP @ T @ GL,
     f"the world's z axis points down: {Z_UP}": lambda T: GL @ T,
@@ -108,18 +111,26 @@ POSES: Mapping[str, Callable[[Array], Array]] = {
     },
 }
 """Conventions of poses (4, 4) other than ours, with their remedy, and how to read such a pose."""
-UNITS: Mapping[str, Callable[[Array], Array]] = {
-    f"depth is in metres, and the translation of T_world_camera in {unit}: give both in metres": partial(
-        _scale_translation, factor=factor
-    )
-    for unit, factor in {
-        "kilometres": 1e3,
-        "decimetres": 0.1,
-        "centimetres": 0.01,
-        "millimetres": 0.001,
+UNITS: Mapping[str, float] = {
+    f"the translation of T_world_camera is {1.0 / factor:.4g} times as long as depth says{unit}: give both in"
+    " metres; in a recording, cam_t_w2c is in millimetres, and depth_scale makes them of depth": factor
+    for factor, unit in {
+        **dict.fromkeys((100.0, 39.37, 10.0, 5.0, 4.0, 2.0, 0.5, 0.25, 0.2), ""),
+        1e3: ", as if in kilometres", 0.1: ", as if in decimetres", 0.0254: ", as if in inches",
+        0.01: ", as if in centimetres", 0.001: ", as if in millimetres",
     }.items()
-}
-"""Units of poses other than that of depth, and how to read such a pose."""
+}  # fmt: skip
+"""Ratios [1] of the units of poses and depth that are met, by what is said of them."""
+MIRRORED = (
+    "the images are mirrored: flip them left to right, with colour and masks; or the poses are left-handed, "
+    "as in Unity and Unreal: convert them"
+)
+"""Causes of a mirrored world, and their remedies."""
+UNLIKE = (
+    "the largest planes are tilted, in each view another way, and no known convention explains it: check "
+    "poses and K"
+)
+"""What is said of tilted planes that no rotation of the world makes level."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -315,8 +326,9 @@ def _overlaps(views: Sequence[View], max_tilt: float) -> dict[str, float]:
     Read as declared, that is "".
     """
     readings: dict[str, tuple[Callable[[View], View], Callable[[Array], Array]]] = {
-        "": (_keep, _keep), **{cause: (_keep, read) for cause, read in {**POSES, **UNITS}.items()},
-        "the images are mirrored: flip them": (_mirror, _keep),
+        "": (_keep, _keep), **{cause: (_keep, read) for cause, read in POSES.items()},
+        **{cause: (_keep, partial(_scale_translation, factor=factor)) for cause, factor in UNITS.items()},
+        MIRRORED: (_mirror, _keep),
         OTHER_CAMERA: (_scale_camera, _keep),
     }  # fmt: skip
     changes = {change for change, _ in readings.values()}
@@ -344,11 +356,13 @@ def _is_better(share: float, declared: float) -> bool:
 
 def _overlap(shown: Sequence[_RaisedPoints], poses: Sequence[Array], max_tilt: float) -> float:
     clouds, shares = [view.points_world(T, max_tilt) for view, T in zip(shown, poses, strict=True)], []
+    readings = np.concatenate([view.points_camera[:, 2] for view in shown])
+    near = NEAR * float(np.median(readings)) if len(readings) else NEAR
     for before, after in pairwise(clouds):
         if min(len(before), len(after)) < LEAST:
             shares.append(0.0)
             continue
-        away, _ = cKDTree(before).query(after, distance_upper_bound=NEAR)
+        away, _ = cKDTree(before).query(after, distance_upper_bound=near)
         shares.append(float(np.isfinite(away).mean()))
     return float(np.median(shares))
 
@@ -400,10 +414,12 @@ class Diagnosis:
             `near` and `far` between which nine in ten readings are [m], horizontal field of view [deg], the
             share of the readings on its largest plane, and that plane's tilt [deg], or None without a pose.
         problems: What is wrong, and how to mend it.
+        doubts: What could not be confirmed, and why.
     """
 
     views: list[dict[str, Any]]
     problems: list[str]
+    doubts: list[str]
 
 
 def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
@@ -421,7 +437,9 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
             continue
         near, far = np.percentile(view.depth[view.valid], (5.0, 95.0))
         bare, plane, posed = thin_view(view), find_image_plane(view), view.T_world_camera is not None
-        said = {"": "", "K": describe_centre(view)}
+        level, centre = posed and _is_level_somewhere(bare, max_tilt), describe_centre(view)
+        # Parts of images have their principal point anywhere.
+        said = {"": "", "K": "" if level else centre}
         if unit := describe_unit(view.depth[view.valid]):
             said["unit"] = f"depth is {near:.4g}–{far:.4g} m{unit}: give metres"
         for check in (partial(check_camera, max_coordinate=config.cloud.max_coordinate), check_depth):
@@ -429,7 +447,7 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
                 check(view)
             except WrongViewError as error:
                 said["unit" if unit else error.remedy] = f"{error.reason}: {error.remedy}"
-        if posed and not _is_level_somewhere(bare, max_tilt):
+        if posed and not level:
             causes = " or ".join(name_causes(bare, max_tilt))
             said[causes] = causes
         for key, text in said.items():
@@ -446,11 +464,26 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         )  # fmt: skip
         thin += [bare] if posed else []
     # One view may show a wall, and no table.
-    problems = [texts[0] for texts in found.values() if 2 * len(texts) > len(rows)]
+    usual = {key: texts[0] for key, texts in found.items() if 2 * len(texts) > len(rows)}
+    normals = np.array([transforms.rotate(v.pose, find_image_plane(v).normal_camera(v.K)) for v in thin])
+    if Z_UP in usual and np.median(
+        transforms.angle_between(normals, np.median(normals, axis=0))
+    ) > np.radians(max_tilt):
+        usual[Z_UP] = UNLIKE
+    doubts, flat = list[str](), sum(row["plane"] >= LARGE for row in rows)
+    if 2 * flat < len(rows):
+        doubts.append("depth and axes, because most views show no plane that holds a fifth of the readings")
     if len(thin) > 1:
-        best = _best_reading(_overlaps(thin, max_tilt))
-        problems = [p for p in problems if not best or best not in p] + ([best] if best else [])
-    return Diagnosis(rows, problems)
+        shares = _overlaps(thin, max_tilt)
+        best = _best_reading(shares)
+        if best == OTHER_CAMERA:
+            usual["K"] = centre or OTHER_CAMERA
+        elif best and not ("unit" in usual and best in UNITS):
+            usual = {key: text for key, text in usual.items() if best not in text} | {best: best}
+        elif not usual and shares[""] < LARGE:
+            shared = f"{shares['']:.0%} of what they show above their largest planes"
+            doubts.append(f"poses, because consecutive views share only {shared}")
+    return Diagnosis(rows, list(usual.values()), doubts)
 
 
 def _is_level_somewhere(view: View, max_tilt: float) -> bool:

@@ -57,7 +57,8 @@ def make_check_report(
         together = [Figure("", draw_cloud(cloud, SupportGraph(), a)) for a in (np.pi + 0.54, 0.54)]
     wrong = [("Wrong", sentence(problem)) for problem in found.problems]
     answer = f"{count_of(len(wrong), 'fault')} in {count_of(len(found.views), 'view')}."
-    sections = [Section("Answer", answer if wrong else "Nothing is wrong.", facts=wrong)]
+    doubts = [("Not confirmed", sentence(doubt)) for doubt in found.doubts]
+    sections = [Section("Answer", answer if wrong else "Nothing is wrong.", facts=wrong + doubts)]
     sections += [Section("World", TOGETHER, together)] if together else []
     sections += [Section("Images", "The largest plane is tinted.", figures)]
     sections.append(Section("Numbers", tables=[table]))
