@@ -336,7 +336,7 @@ def _overlaps(views: Sequence[View], max_tilt: float) -> dict[str, float]:
     poses, shares = [view.pose for view in views], {}
     for cause, (change, read) in readings.items():
         shares[cause] = _overlap(shown[change], [read(T) for T in poses], max_tilt)
-    if len(views) > 2:  # A clock that is off by less than a view does not tell.
+    if len(views) > 3:  # One pair of views may agree by chance.
         shares[EARLY] = _overlap(shown[_keep][:-1], poses[1:], max_tilt)
         shares[LATE] = _overlap(shown[_keep][1:], poses[:-1], max_tilt)
     return shares
