@@ -230,11 +230,12 @@ MANY = '<replicate count="1000"><replicate count="1000"><geom size="0.1"/></repl
         ("<worldbody>", f"<asset>{HILLS}</asset><worldbody>", "its hfield has 4e+08 elements"),
         ("<freejoint/>", f"<freejoint/>{MANY}", "its replicate has 1e+06 elements"),
         ("<worldbody>", '<option gravity="0 0 -1e15"/><worldbody>', "unstable"),
+        ("<worldbody>", '<worldbody><geom name="\xfd" size="0.01"/>', "a name that is not UTF-8"),
     ],
 )
 def test_a_scene_that_cannot_be_simulated(tmp_path, refused, old, new, says):
     path = tmp_path / "scene.xml"
-    path.write_text(TWO_ON_A_TABLE.replace(old, new))
+    path.write_text(TWO_ON_A_TABLE.replace(old, new), encoding="latin-1")
     refused("explore", path, says=says)
 
 

@@ -128,9 +128,10 @@ class _Bag:
             # Before ROS 2 Iron, sqlite3 bags did not store message definitions; those read here are alike.
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
+            messages = self._reader.message_count
         weakref.finalize(self, self._reader.close)
         self._types = {c.topic: c.msgtype for c in self._reader.connections}
-        if not self._reader.message_count:
+        if not messages:
             raise InputError(path, "the bag has no messages", "record it again")
 
     def topics(self, kind: str) -> list[str]:

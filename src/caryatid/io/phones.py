@@ -285,10 +285,10 @@ class _Video:
         try:
             file = self._av.open(str(self._path), metadata_errors="replace")
             stream = file.streams.video[0]
-        except (self._av.error.FFmpegError, OSError, IndexError) as error:
+            self.size = stream.width, stream.height
+        except (self._av.error.FFmpegError, OSError, IndexError, AttributeError) as error:
             reason = f"cannot be read ({getattr(error, 'strerror', error)})"
             raise InputError(self._path, reason, AGAIN) from None
-        self.size = stream.width, stream.height
         self._frames, self._last = enumerate(file.decode(stream)), -1
 
     def decode(self, number: int) -> NDArray[np.uint8]:

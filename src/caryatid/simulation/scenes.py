@@ -163,9 +163,12 @@ def load_scene(
             spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise world.rejection(error, str(path)) from None
-    robots = lay_out(spec, str(path), keyframe)
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
-    scene = world.scene_from_spec(spec, name or path.stem, str(path), config)
+    try:
+        robots = lay_out(spec, str(path), keyframe)
+        scene = world.scene_from_spec(spec, name or path.stem, str(path), config)
+    except UnicodeDecodeError:
+        raise InputError(path, "has a name that is not UTF-8", "correct the XML") from None
     scene.geom_labels[np.isin(scene.model.geom_bodyid, robots)] = -1
     top, bodies = world.table_centre(scene)[2], scene.object_bodies
     started = scene.model.qpos0[world.pose_addresses(scene)][:, 2]
