@@ -478,7 +478,9 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         best = _best_reading(shares)
         if best == OTHER_CAMERA:
             usual["K"] = centre or OTHER_CAMERA
-        elif best and not ("unit" in usual and best in UNITS):
+        elif best in UNITS and "unit" in usual:
+            usual["unit"] += f" (by the poses, {UNITS[best]:.4g} times as long as it should be)"
+        elif best:
             usual = {key: text for key, text in usual.items() if best not in text} | {best: best}
         elif not usual and shares[""] < LARGE:
             shared = f"{shares['']:.0%} of what they show above their largest planes"
