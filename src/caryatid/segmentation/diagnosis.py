@@ -126,7 +126,7 @@ MIRRORED = (
     "as in Unity and Unreal: convert them"
 )
 """Causes of a mirrored world, and their remedies."""
-UNLIKE = (
+INCONSISTENT = (
     "the largest planes are tilted, in each view another way, and no known convention explains it: check "
     "poses and K"
 )
@@ -145,7 +145,7 @@ class ImagePlane:
     affine: Array
     share: float
 
-    def excess(self, view: View) -> Array:
+    def residuals(self, view: View) -> Array:
         """How much farther (H, W) each pixel of the image is than it, relative to it [1]; −1 = no reading."""
         v, u = np.indices(view.depth.shape)
         inverse: Array = u * self.affine[0] + v * self.affine[1] + self.affine[2]
@@ -153,7 +153,7 @@ class ImagePlane:
 
     def mask(self, view: View) -> NDArray[np.bool_]:
         """Which pixels (H, W) of the image lie on it, with twice the usual noise."""
-        return np.abs(self.excess(view)) < 2.0 * FLAT
+        return np.abs(self.residuals(view)) < 2.0 * FLAT
 
     def normal_camera(self, K: Array) -> Array:
         """Its unit normal (3,) towards the camera, if the pinhole matrix is K (3, 3) [px]."""
@@ -382,7 +382,7 @@ class _RaisedPoints:
     @classmethod
     def of(cls, view: View) -> _RaisedPoints:
         plane = find_image_plane(view)
-        above = np.flatnonzero(view.valid & (plane.excess(view) < -4.0 * FLAT))
+        above = np.flatnonzero(view.valid & (plane.residuals(view) < -4.0 * FLAT))
         above = above[:: max(1, len(above) // SAMPLES)] if plane.share >= LARGE else above[:0]
         return cls(plane.normal_camera(view.K), view.points_camera.reshape(-1, 3)[above])
 
@@ -465,11 +465,11 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         thin += [bare] if posed else []
     # One view may show a wall, and no table.
     usual = {key: texts[0] for key, texts in found.items() if 2 * len(texts) > len(rows)}
-    normals = np.array([transforms.rotate(v.pose, find_image_plane(v).normal_camera(v.K)) for v in thin])
-    if Z_UP in usual and np.median(
-        transforms.angle_between(normals, np.median(normals, axis=0))
-    ) > np.radians(max_tilt):
-        usual[Z_UP] = UNLIKE
+    if Z_UP in usual:
+        normals = np.array([transforms.rotate(v.pose, find_image_plane(v).normal_camera(v.K)) for v in thin])
+        angles = transforms.angle_between(normals, np.median(normals, axis=0))
+        if np.degrees(np.median(angles)) > max_tilt:
+            usual[Z_UP] = INCONSISTENT
     doubts, flat = list[str](), sum(row["plane"] >= LARGE for row in rows)
     if 2 * flat < len(rows):
         doubts.append("depth and axes, because most views show no plane that holds a fifth of the readings")

@@ -58,7 +58,7 @@ def make_check_report(
     wrong = [("Wrong", sentence(problem)) for problem in found.problems]
     answer = f"{count_of(len(wrong), 'fault')} in {count_of(len(found.views), 'view')}."
     doubts = [("Not confirmed", sentence(doubt)) for doubt in found.doubts]
-    sections = [Section("Answer", answer if wrong else "Nothing is wrong.", facts=wrong + doubts)]
+    sections = [Section("Answer", answer if wrong else "No fault was found.", facts=wrong + doubts)]
     sections += [Section("World", TOGETHER, together)] if together else []
     sections += [Section("Images", "The largest plane is tinted.", figures)]
     sections.append(Section("Numbers", tables=[table]))
