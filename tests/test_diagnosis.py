@@ -49,6 +49,21 @@ FAULTS = {
     "as long as depth says, as if in millimetres": posed(
         lambda T: transforms.rigid(T[:3, :3], 1e3 * T[:3, 3])
     ),
+    "only the rotation of T_world_camera is inverse": posed(
+        lambda T: transforms.rigid(T[:3, :3].T, T[:3, 3])
+    ),
+    "all views have the same pose": posed(lambda T: from_the_side()),
+    r"tilted by 3\.8°, always the same way .*\(hand-eye calibration\)$": posed(
+        lambda T: (
+            T
+            @ transforms.rigid(
+                transforms.rotation_from_vector(np.array([0.0, 0.0, np.deg2rad(5.0)])), np.zeros(3)
+            )
+        )
+    ),
+    r"multiply the focal lengths by 0\.8": lambda v: replace(
+        v, K=v.K * [[1.25, 1, 1], [1, 1.25, 1], [1, 1, 1]]
+    ),
     "mirrored": lambda v: replace(v, depth=v.depth[:, ::-1].copy(), rgb=None, labels=None),
 }
 
@@ -142,3 +157,11 @@ def test_following_what_check_says_gives_the_same_recording(sound, spoil, settin
     for view, right in zip(open_dataset(tmp_path / "spoilt", config.recording), sound, strict=True):
         assert np.allclose(view.pose, right.pose, atol=1e-6)
         assert np.allclose(view.depth, right.depth, atol=1e-3)
+
+
+def test_a_tilted_world_is_right_once_levelled(sound, tmp_path, capsys):
+    turn = transforms.rigid(transforms.rotation_from_vector(np.array([0.5, 0.0, 0.0])), np.zeros(3))
+    write_recording(tmp_path / "tilted", [posed(lambda T: turn @ T)(view) for view in sound])
+    assert run_command("check", tmp_path / "tilted") == 1
+    assert "--level" in capsys.readouterr().out
+    assert run_command("check", tmp_path / "tilted", "--level") == 0

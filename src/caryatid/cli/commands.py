@@ -205,6 +205,8 @@ class Check(options.Command, work="results:check_views"):
     """Recording: a folder in the BOP or TUM RGB-D format, or of a phone; import bags first."""
     report: Annotated[Path | None, options.shown("FILE.html")] = None
     """Also write a page with pictures of up to 12 views, and of all of them together."""
+    level: options.Flag = False
+    """Rotate the world frame so that the table is level before it is checked."""
     settings: options.Settings = options.Settings()
 
 

@@ -23,7 +23,7 @@ from caryatid.errors import InputError, needs_extra
 from caryatid.evaluation.truths import evaluate_run
 from caryatid.exports import export_graph, format_of
 from caryatid.io.datasets import OpenOptions, open_dataset
-from caryatid.io.importing import import_recording, reasons
+from caryatid.io.importing import import_recording, levelled, reasons
 from caryatid.io.staging import write_file
 from caryatid.manipulation.order import plan_order
 from caryatid.runtime import fingerprint
@@ -42,6 +42,7 @@ def check_views(command: Check) -> int:
         raise InputError(source, "is a cloud", "run `caryatid extract`, which checks its unit and its frame")
     dataset = open_dataset(source, config.recording)
     with command.output.working("looking"):
+        dataset = levelled(dataset, config) if command.level else dataset
         found = diagnose(dataset, config)
     columns = {
         "view": "view", "size": "size\n[px]", "field_of_view": "width\n[°]", "readings": "readings",

@@ -44,6 +44,8 @@ OFF_CENTRE = 0.2
 """How far the principal point may be from the image's middle [image widths and heights]."""
 NEAR = 0.015
 """Distance of the same point in two views, relative to the reading [1]; poses are off by about 1 cm."""
+MOUNTED = 2.0
+"""Error of a camera's orientation on its arm that calibration leaves [deg]; 3.5 cm at 1 m."""
 LEAST = 20
 """Minimum number of points above the table that tell whether two views show the same [1]."""
 
@@ -81,6 +83,10 @@ def _roll_quaternion(T: Array, by: int) -> Array:
 def _turn_camera(T: Array, angle: float) -> Array:
     turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()
     return transforms.rigid(T[:3, :3] @ turn, T[:3, 3])
+
+
+def _transpose_rotation(T: Array) -> Array:
+    return transforms.rigid(T[:3, :3].T, T[:3, 3])
 
 
 def _scale_translation(T: Array, factor: float) -> Array:
@@ -131,6 +137,12 @@ INCONSISTENT = (
     "poses and K"
 )
 """What is said of tilted planes that no rotation of the world makes level."""
+
+
+TRANSPOSED = "only the rotation of T_world_camera is inverse: transpose it"
+"""A cause of wrong camera poses, and its remedy."""
+FIXED = "all views have the same pose, but do not show the same: give each its own"
+"""A cause of wrong camera poses, and its remedy."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -328,6 +340,7 @@ def _overlaps(views: Sequence[View], max_tilt: float) -> dict[str, float]:
     readings: dict[str, tuple[Callable[[View], View], Callable[[Array], Array]]] = {
         "": (_keep, _keep), **{cause: (_keep, read) for cause, read in POSES.items()},
         **{cause: (_keep, partial(_scale_translation, factor=factor)) for cause, factor in UNITS.items()},
+        TRANSPOSED: (_keep, _transpose_rotation),
         MIRRORED: (_mirror, _keep),
         OTHER_CAMERA: (_scale_camera, _keep),
     }  # fmt: skip
@@ -430,6 +443,7 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         config: The largest depth, and the tilt of a level plane.
     """
     rows, thin, found = list[dict[str, Any]](), list[View](), dict[str, list[str]]()
+    conventions = set[str]()
     max_tilt = config.surface.max_tilt
     for view in views:
         if not view.valid.any():
@@ -450,6 +464,7 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         if posed and not level:
             causes = " or ".join(name_causes(bare, max_tilt))
             said[causes] = causes
+            conventions.add(causes)
         for key, text in said.items():
             found.setdefault(key, []).extend([text] if text else [])
         tilt = _tilt(view.pose, plane.normal_camera(view.K)) if posed else None
@@ -467,8 +482,7 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
     usual = {key: texts[0] for key, texts in found.items() if 2 * len(texts) > len(rows)}
     if Z_UP in usual:
         normals = np.array([transforms.rotate(v.pose, find_image_plane(v).normal_camera(v.K)) for v in thin])
-        angles = transforms.angle_between(normals, np.median(normals, axis=0))
-        if np.degrees(np.median(angles)) > max_tilt:
+        if _median_angle(normals, np.median(normals, axis=0)) > max_tilt:
             usual[Z_UP] = INCONSISTENT
     doubts, flat = list[str](), sum(row["plane"] >= LARGE for row in rows)
     if 2 * flat < len(rows):
@@ -476,16 +490,76 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
     if len(thin) > 1:
         shares = _overlaps(thin, max_tilt)
         best = _best_reading(shares)
-        if best == OTHER_CAMERA:
+        mounting = _explain_tilts(thin)
+        if mounting and best in ("", EARLY, LATE) and usual.keys() <= {Z_UP}:
+            usual = {mounting: mounting}
+        elif best == OTHER_CAMERA:
             usual["K"] = centre or OTHER_CAMERA
         elif best in UNITS and "unit" in usual:
             usual["unit"] += f" (by the poses, {UNITS[best]:.4g} times as long as it should be)"
         elif best:
-            usual = {key: text for key, text in usual.items() if best not in text} | {best: best}
+            usual = {key: text for key, text in usual.items() if key not in conventions} | {best: best}
+        elif _have_one_pose(thin):
+            usual = {FIXED: FIXED}
         elif not usual and shares[""] < LARGE:
             shared = f"{shares['']:.0%} of what they show above their largest planes"
             doubts.append(f"poses, because consecutive views share only {shared}")
     return Diagnosis(rows, list(usual.values()), doubts)
+
+
+def _have_one_pose(views: Sequence[View]) -> bool:
+    """Whether all views have one pose, though most of what one shows above its largest plane moves."""
+    if any(not np.allclose(view.pose, views[0].pose, atol=1e-6) for view in views):
+        return False
+    shares = []
+    for before, after in pairwise(views):
+        raised = before.valid & (find_image_plane(before).residuals(before) < -4.0 * FLAT)
+        same = (
+            np.abs(before.depth - after.depth) < NEAR * before.depth
+            if before.depth.shape == after.depth.shape
+            else np.zeros_like(raised)
+        )
+        shares.append(1.0 - float(same[raised].mean()) if raised.any() else 0.0)
+    return bool(np.median(shares) > 0.5)
+
+
+def _explain_tilts(views: Sequence[View]) -> str:
+    """Say that cameras are turned against their poses, or K is wrong, if planes are tilted so; else "".
+
+    Such a tilt goes with the camera, that of a world frame with the world.
+    """
+    planes = [(view.K, view.pose, find_image_plane(view)) for view in views]
+    # A plane that is tilted by more is a wall, and no table.
+    tables = [(K, T, p) for K, T, p in planes if p.share >= LARGE and _tilt(T, p.normal_camera(K)) < 45.0]
+    if len(tables) < 2:
+        return ""
+    ups, normals = np.array([(T[2, :3], plane.normal_camera(K)) for K, T, plane in tables]).swapaxes(0, 1)
+    normals_world = np.array([transforms.rotate(T, plane.normal_camera(K)) for K, T, plane in tables])
+    spread = _median_angle(normals_world, np.median(normals_world, axis=0))
+    # A small turn q of the camera moves each normal n by the part of q across n.
+    across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
+    q = np.linalg.lstsq(across.reshape(-1, 3), np.cross(normals, ups).ravel(), rcond=0.1)[0]
+    turn = Rotation.from_rotvec(q)
+    if spread < MOUNTED or _median_angle(turn.apply(normals), ups) > 0.5 * spread:
+        return ""
+    said = (
+        f"the largest planes are tilted by {_median_angle(normals, ups):.1f}°, always the same way for "
+        "the camera: check how it is mounted (hand-eye calibration)"
+    )
+    factors = np.geomspace(0.5, 2.0, 57)  # 2.5 % apart
+    scaled = [
+        [plane.normal_camera(K * [[f, 1, 1], [1, f, 1], [1, 1, 1]]) for K, _, plane in tables]
+        for f in factors
+    ]
+    tilts = [_median_angle(np.array(n), ups) for n in scaled]
+    if min(tilts) < 0.5 * spread:
+        said += f", or multiply the focal lengths by {factors[int(np.argmin(tilts))]:.2g}"
+    return said
+
+
+def _median_angle(a: Array, b: Array) -> float:
+    """Median angle [deg] between vectors (N, 3)."""
+    return float(np.degrees(np.median(transforms.angle_between(a, b))))
 
 
 def _is_level_somewhere(view: View, max_tilt: float) -> bool:
