@@ -29,6 +29,8 @@ from synthetic import (
 )
 
 from caryatid.config import SupportConfig
+from caryatid.evaluation.scores import score
+from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry import transforms
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.camera import SimulatedCamera
@@ -197,3 +199,12 @@ def test_a_place_seen_often_has_no_more_points():
         counts.append(len(scene.cloud))
     assert counts[7] > 6 * counts[0], "eight views are kept whole"
     assert counts[-1] < 0.8 * counts[7]
+
+
+def test_further_views_of_two_tables_take_nothing_away_and_add_no_legs():
+    name = "storeys-7-953"
+    views = simulated_views(name, (180.0, 108.0, 252.0, 36.0), "carmine", vga=True)
+    graph = model_of(list(views), segmentation="auto").graph
+    found = score(graph, true_scene_from_simulation(simulated_scene(name)))
+    assert found.f1 == 1.0, found
+    assert found.mean_iou > 0.9

@@ -227,6 +227,13 @@ def test_the_table_is_found_not_the_floor(sigma):
     np.testing.assert_allclose(sorted(surface.shape.extents), [0.04, 0.6, 0.9], atol=0.03)
 
 
+def test_the_tops_of_books_in_the_middle_are_not_the_table():
+    books = [(np.array([0.0, y, TABLE + 0.02]), np.array([0.3, 0.24, 0.04])) for y in (-0.13, 0.13)]
+    scene = model_of([table_scene(from_the_side(distance=0.8), books, sigma=0.0005)], segmentation="auto")
+    assert scene.surface.point_world[2] == pytest.approx(TABLE, abs=0.002)
+    assert len(scene.graph.objects) == 3
+
+
 @pytest.mark.parametrize(("degrees", "level"), [(8.0, True), (12.0, False)])
 def test_a_support_surface_leans_by_at_most_ten_degrees(degrees, level):
     R = transforms.rotation_from_vector((np.radians(degrees), 0.0, 0.0))

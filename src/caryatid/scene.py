@@ -398,7 +398,11 @@ class Scene(Pictured):
 
     def _observed(self, source: View | Cloud) -> Observation:
         rng = np.random.default_rng([self.seed, self.views])
-        return observe(source, self.config, segmentation=self.segmentation, known=self.surfaces, rng=rng)
+        carrying = {SUPPORT_LABEL - o.label for o in self.graph.support_surfaces}
+        return observe(
+            source, self.config,
+            segmentation=self.segmentation, known=self.surfaces, carrying=carrying, rng=rng,
+        )  # fmt: skip
 
     @one_blas_thread
     def _take_in(self, source: View | Cloud) -> None:

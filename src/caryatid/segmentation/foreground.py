@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 
 import numpy as np
 import shapely
@@ -24,20 +24,21 @@ THIN = 0.03
 """Maximum thickness of a wall, as far as it is seen [m]: a board, and the noise of its readings."""
 ENOUGH = 4000
 """Number of points that show where the parts of a view are [1]: a hundred of each."""
-TOUCHING = 3
-"""Minimum number of samples in which a body meets the surface that it stands on [1]."""
 
 
-def find_foreground(view: View, surfaces: Sequence[SupportSurface], config: Config) -> list[Mask]:
+def find_foreground(
+    view: View, surfaces: Sequence[SupportSurface], config: Config, carrying: Set[int] = frozenset()
+) -> list[Mask]:
     """Find the pixels of what may stand, directly or not, on each of some surfaces.
 
-    A pixel belongs to the highest surface below it. On other surfaces than the main one, objects touch the
-    surface, are wholly in the image, no higher than objects are, and near the middle of the main surface.
+    A pixel belongs to the highest surface below it. On other surfaces than the main one, objects reach
+    down to it, are wholly in the image, no higher than objects are, and near the middle of the main surface.
 
     Args:
         view: The view, which has a pose.
         surfaces: The support surfaces, the main one first.
         config: Sampling, margins and sizes.
+        carrying: Numbers of surfaces that carry something in earlier views.
 
     Returns:
         For each surface, which pixels (H, W).
@@ -46,12 +47,13 @@ def find_foreground(view: View, surfaces: Sequence[SupportSurface], config: Conf
     low, high, margin = settings.clearance, settings.max_height, settings.margin
     if len(surfaces) == 1:
         return [surfaces[0].pixels_over(view, low, high, margin)]
-    owner, level = np.zeros((2, *view.depth.shape), dtype=np.int32)
+    owner: NDArray[np.int32] = np.zeros(view.depth.shape, dtype=np.int32)
     for k in sorted(range(len(surfaces)), key=lambda k: -surfaces[k].point_world[2]):
         # Walls of a room are over its floor.
-        over = surfaces[k].pixels_over(view, -low, np.inf if k else high, margin) & (owner + level == 0)
+        over = surfaces[k].pixels_over(view, -low, np.inf if k else high, margin) & (owner == 0)
         on = over & ~surfaces[k].pixels_over(view, low, np.inf, margin)
-        level[on], owner[over & ~on] = k + 1, k + 1
+        owner[over] = k + 1
+        owner[on] = -1
     step = settings.stride
     grid = np.s_[::step, ::step]
     depth, jump = view.depth[grid].astype(np.float64), 2.0 * settings.edge_jump
@@ -68,7 +70,6 @@ def find_foreground(view: View, surfaces: Sequence[SupportSurface], config: Conf
         """Share of the samples of each body."""
         return np.asarray(np.bincount(index, which, len(names)) / sizes)
 
-    meeting = find_meeting(body, owner[grid], level[grid], inverse_depth, jump)[names]
     near = (
         np.linalg.norm(points[:, :2] - surfaces[0].point_world[:2], axis=1)
         < min(config.voxels.extent[:2]) / 2.0
@@ -79,13 +80,15 @@ def find_foreground(view: View, surfaces: Sequence[SupportSurface], config: Conf
     # Noise of a far floor makes many small bodies.
     area = np.bincount(index, (step * depth.ravel()[rows]) ** 2, len(names)) / (view.K[0, 0] * view.K[1, 1])
     small = area < settings.min_area
-    unfit = (stands_on > 0) & ((meeting < TOUCHING) | (share(near) < 0.5) | cut | small)
+    unfit = (stands_on > 0) & ((share(near) < 0.5) | cut | small)
     height = np.select(
         [stands_on[index] == k for k in range(len(surfaces))], [s.height(points) for s in surfaces]
     )
     top = np.full(len(names), -np.inf)
     np.maximum.at(top, index, height)
     unfit |= (stands_on > 0) & ((top > high) | (share(height > 2.0 * low) < 0.05))
+    # Of a ball that stands on a surface, less than the lower half is hidden by itself.
+    unfit |= (stands_on > 0) & (share(height < 0.5 * top[index]) == 0.0)
     # What hides the upper end of a body may be what it carries.
     highest = np.lexsort((height, index))[np.cumsum(sizes) - 1]
     row, column = np.divmod(rows[highest], body.shape[1])
@@ -94,11 +97,11 @@ def find_foreground(view: View, surfaces: Sequence[SupportSurface], config: Conf
     unfit |= find_furniture(points, index, stands_on, surfaces, config, hidden)
     lost = np.isin(body, names[unfit]).repeat(step, 0).repeat(step, 1)
     owner[lost[: owner.shape[0], : owner.shape[1]]] = 0
-    carrying = {0, *stands_on[~unfit].tolist()}
-    if len(carrying) < len(surfaces):
+    numbers = sorted({0, *carrying, *stands_on[~unfit].tolist()})
+    if len(numbers) < len(surfaces):
         # What carries nothing may itself be the top of an object.
-        numbers = sorted(carrying)
-        some = find_foreground(view, [surfaces[k] for k in numbers], config)
+        kept = {n for n, k in enumerate(numbers) if k in carrying}
+        some = find_foreground(view, [surfaces[k] for k in numbers], config, kept)
         found = dict(zip(numbers, some, strict=True))
         return [found.get(k, np.zeros_like(view.valid)) for k in range(len(surfaces))]
     return [(owner == k + 1) & surface.pixels_over(view, low, high) for k, surface in enumerate(surfaces)]
@@ -150,32 +153,12 @@ def find_furniture(
             np.bincount(part, which, count) / sizes for which in (away <= THIN, border, within)
         )
         room = surface.point_world[2] - lowest
-        leg = (under > MOST) & (along > PARTLY) & (hidden | (highest > lowest + room - margin))
+        # What is higher than objects are is left out.
+        reach = lowest + np.minimum(room, config.segmentation.max_height) - margin
+        leg = (under > MOST) & (along > PARTLY) & (hidden | (highest > reach))
         wall = (close > MOST) & (longest > config.surface.min_width)
         furniture |= ((room > 0.0) & leg) | ((room == 0.0) & wall)
     return furniture
-
-
-@kernel
-def find_meeting(body, owner, level, inverse_depth, jump):  # type: ignore[no-untyped-def]
-    """In how many places (H·W,) each body meets readings of its own surface, without a jump of 1/z [1/m].
-
-    Bodies (H, W) are those of `find_bodies`; owner and level (H, W) are the numbers of the surfaces that a
-    place is over, or of. Between the two, one place may be neither.
-    """
-    height, width = body.shape
-    meeting = np.zeros(height * width, np.int64)
-    for row in range(height):
-        for column in range(width):
-            if body[row, column] < 0:
-                continue
-            met = False
-            for down, right in ((1, 0), (2, 0), (0, 1), (0, 2), (-1, 0), (-2, 0), (0, -1), (0, -2)):
-                v, u = row + down, column + right
-                if 0 <= v < height and 0 <= u < width and level[v, u] == owner[row, column]:
-                    met = met or abs(inverse_depth[v, u] - inverse_depth[row, column]) <= jump
-            meeting[body[row, column]] += met
-    return meeting
 
 
 @kernel

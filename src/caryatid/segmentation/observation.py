@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -115,6 +115,7 @@ def observe(
     *,
     segmentation: SegmentationMethod | None,
     known: Sequence[SupportSurface],
+    carrying: Set[int] = frozenset(),
     rng: np.random.Generator,
 ) -> Observation:
     """Find the support surfaces and the segments on them.
@@ -124,6 +125,7 @@ def observe(
         config: All stages' settings.
         segmentation: `labels` requires labels, `auto` ignores them, None uses them where given.
         known: The support surfaces known so far, the main one first.
+        carrying: Numbers of those that carry something.
         rng: Source of the samples.
 
     Raises:
@@ -174,11 +176,17 @@ def observe(
     if given is not None:
         labels = given
     elif isinstance(source, View):
-        image, apart = segment_view(source, surfaces, config, rng)
+        image, apart = segment_view(source, surfaces, config, rng, carrying)
         labels = image.ravel()[pixels]
         apart = apart[np.isin(apart, labels).all(axis=1)]
     else:
         labels = segment_cloud(cloud, surfaces[0], config.segmentation)
+    below = find_surface_below(surfaces, cloud.points_world[labels > 0])
+    held = np.bincount(below, minlength=len(surfaces))
+    if not known and held[0] == 0 and held.any():
+        # The camera looks at what carries something, and past it at what does not.
+        main = int(np.argmax(held))
+        surfaces = (surfaces[main], *surfaces[:main], *surfaces[main + 1 :])
     reach = config.surface.tolerance
     for k, surface in enumerate(surfaces):
         on_surface = (labels == 0) & surface.over(cloud.points_world, -reach, reach, reach)
@@ -188,7 +196,11 @@ def observe(
 
 
 def segment_view(
-    view: View, surfaces: Sequence[SupportSurface], config: Config, rng: np.random.Generator
+    view: View,
+    surfaces: Sequence[SupportSurface],
+    config: Config,
+    rng: np.random.Generator,
+    carrying: Set[int] = frozenset(),
 ) -> tuple[Labels, Pairs]:
     """Cut a view into the segments on all surfaces; the result is that of `segment`.
 
@@ -197,8 +209,9 @@ def segment_view(
         surfaces: The support surfaces, the main one first.
         config: All settings.
         rng: Draws the samples of fits.
+        carrying: Numbers of surfaces that carry something in earlier views.
     """
-    foregrounds = find_foreground(view, surfaces, config)
+    foregrounds = find_foreground(view, surfaces, config, carrying)
     image, pairs = np.zeros(view.depth.shape, dtype=np.int32), [np.empty((0, 2), dtype=np.int32)]
     for k, (surface, own) in enumerate(zip(surfaces, foregrounds, strict=True)):
         others = [f for n, f in enumerate(foregrounds) if n != k]

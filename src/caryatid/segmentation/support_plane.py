@@ -118,7 +118,7 @@ class SupportSurface:
 
     Attributes:
         normal_world: Unit normal (3,), upwards.
-        point_world: Centroid of the inliers, moved onto the plane (3,) [m].
+        point_world: Centroid of the inliers in the first view that shows it, moved onto the plane (3,) [m].
         outline_world: Convex hull (M, 3) of the inliers on the plane [m], counter-clockwise seen from above.
         shape: Thin box whose top face is the smallest rectangle around the outline; its z is the normal.
         core: Where it was seen; in a view, also what lies between.
@@ -233,6 +233,10 @@ class SupportSurface:
         # What is nearer hides the border.
         known = (z > 0.0) & (behind > -config.search)
         return bool(np.mean(behind[known] > config.search) > OPEN) if rooms and known.any() else True
+
+    def placed(self, point_world: Array) -> SupportSurface:
+        """Return the surface with the point on it that is nearest to another (3,) [m]."""
+        return replace(self, point_world=point_world - self.height(point_world) * self.normal_world)
 
     def moved(self, T: Array) -> SupportSurface:
         """Return the surface moved by a rigid transform (4, 4) of the world, by less than a square."""
@@ -416,7 +420,8 @@ def find_support_surfaces(
         height, wide = surface.height(points), surface.region.grown(config.gap)
         near = left & (np.abs(height) < config.search) & wide.holds(points)
         plane = scene.largest_plane(_some(near, 1_000 if surfaces else 5_000), rng)
-        surfaces.append(surface if plane is None else _surface(points, plane, config, surface))
+        same = None if plane is None else _surface(points, plane, config, surface)
+        surfaces.append(surface if same is None else same.placed(surface.point_world))
         left &= ~near
     planes: list[_Plane] = []
     left, most = (_some(left, 1_000), 2) if known else (left, MOST_PLANES)
@@ -476,7 +481,7 @@ def refitted(
     normal, everywhere = surface.normal_world, np.ones(len(points), dtype=bool)
     scene = _Scene(points, normals, up, config)
     plane = scene.refined(everywhere, normal, float(normal @ surface.point_world))
-    return None if plane is None else _surface(points, plane, config)
+    return None if plane is None else _surface(points, plane, config).placed(surface.point_world)
 
 
 def _choose_table(
@@ -486,24 +491,32 @@ def _choose_table(
 
     A point belongs to the highest plane below it. Without weights, only what stands on a plane counts, unless
     it is below another, as legs are: a floor is larger than a table. Planes as large as furniture come first.
+    A plane with little room above a larger one around it is the tops of objects on that.
     """
     heights, below = np.full((len(planes), len(every)), np.inf), np.zeros(len(every), dtype=np.bool_)
+    stands_on = np.arange(len(planes))
+    shown = [np.compress(plane.inliers, points, axis=0) for plane in planes]
     for k, plane in enumerate(planes):
         basis = _basis(plane.normal)
-        flat = every @ basis.T
-        seen = np.compress(plane.inliers, points, axis=0) @ basis.T
-        region = Region.around(seen, CELL)
-        region = region.filled() if weights is None else region
-        own = region.grown(2.0 * CELL).holds(flat)
+        region = Region.around(shown[k] @ basis.T, CELL)
+        around = region.filled().grown(2.0 * CELL)
+        own = (around if weights is None else region.grown(2.0 * CELL)).holds(every @ basis.T)
         height = every @ plane.normal - plane.offset
         heights[k] = np.where(own & (height > -config.tolerance), height, np.inf)
         below |= own & (height < -config.tolerance)
+        for n, other in enumerate(planes):
+            room = shown[n] @ plane.normal - plane.offset
+            inside = around.holds(shown[n] @ basis.T) & (room > 0.0) & (room < ROOM)
+            if other.area < plane.area and inside.mean() > SHOWN:
+                stands_on[n] = k
     least = heights.min(axis=0)
     if weights is None:
         weights = np.where((least > config.search) & ~below, 1.0, 0.01)
     over = np.isfinite(least)
-    shown = np.bincount(heights[:, over].argmin(axis=0), weights[over], minlength=len(planes))
-    return max(range(len(planes)), key=lambda k: (planes[k].area >= config.min_width**2, shown[k]))
+    for _ in planes:
+        stands_on = stands_on[stands_on]
+    looked_at = np.bincount(stands_on[heights[:, over].argmin(axis=0)], weights[over], minlength=len(planes))
+    return max(range(len(planes)), key=lambda k: (planes[k].area >= config.min_width**2, looked_at[k]))
 
 
 def _surface(
