@@ -204,6 +204,11 @@ HELD = {
     **{f"a wall beside, {gap}": (let_down_at_a_wall(gap), "o0-o1 o1-o2 o0-o3") for gap in (1.5e-3, 4e-3)},
     "steep faces and friction": (STEEP, "o0-o1 o0-o2 o1-o3 o2-o3"),
     "in the air": (scene(Sphere(at(0, 0, 0.4), 0.03)), ""),
+    "on something unseen": (scene(*(o.shape.moved(at(0, 0, 0.2)) for o in bridge()[1:])), "o1-o3 o2-o3"),
+    "beside what is on something unseen": (
+        scene(*(o.shape.moved(at(0, 0, 0.1)) for o in tower()[1:4]), block(0.08, 0, 0, (0.05, 0.2, 0.15))),
+        "o1-o2 o2-o3 o0-o4",
+    ),
     "sunk in the table": (scene(block(0, 0, -0.025, (0.06, 0.06, 0.05))), "o0-o1"),
 }
 """Objects, and what holds what: `-` bottom-up, `/` leaning, `>` from the top down."""

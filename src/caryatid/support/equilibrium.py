@@ -207,8 +207,8 @@ class Equilibrium:
     a gap is closed only where an object would fall or tip into it.
 
     Args:
-        objects: The support surface, which does not move, and the objects; N in all. Without a surface those
-            that touch nothing below them do not.
+        objects: The support surface, which does not move, and the objects; N in all. Something unseen holds
+            the lowest of those that nothing carries, so that it does not move either.
         config: The unknowns, and how far an object may fall.
 
     Attributes:
@@ -228,8 +228,6 @@ class Equilibrium:
             [c.b if c.normal_world[2] > 0.0 else c.a for c in self.contacts], dtype=np.intp
         )
         self.fixed = np.array([o.role == "support_surface" for o in objects], dtype=np.bool_)
-        if not self.fixed.any():
-            self.fixed = ~np.isin(np.arange(len(objects)), self._uppers)
         ends, count = self._pairs[~self.fixed[self._pairs].any(axis=1)].T, len(objects)
         graph = coo_array((np.ones(len(ends[0])), tuple(ends)), shape=(count, count))
         self._islands = connected_components(graph, directed=False)[1]
@@ -253,6 +251,15 @@ class Equilibrium:
         self._model = _engine(max(16, 1 << (len(objects) - 1).bit_length()), threading.get_ident())
         self._data = self._with_contacts()
         self._warm = np.zeros(self._model.nv)
+        lowest = Primitives.of(shapes).bounds()[0][:, 2]
+        while len(falling := self._falling()):
+            self.fixed[falling[np.argmin(lowest[falling])]] = True
+            self._data = self._with_contacts()
+
+    def _falling(self) -> NDArray[np.intp]:
+        """Objects (M,) that nothing carries in the estimated scene, by index."""
+        pushes = self.solve(next(self.draws(np.random.default_rng(0)))).pushes
+        return np.flatnonzero((pushes[..., 2].sum(axis=0) <= self._config.force_share) & ~self.fixed)
 
     def draws(self, rng: np.random.Generator) -> Iterator[Draw]:
         """Draw scenes: first the estimated one, then others as likely.
