@@ -305,3 +305,15 @@ def test_a_profile_tells_the_time_of_each_stage_and_view(tmp_path, scene_file, c
     for number, (view, step) in enumerate(zip(document["profile"], steps, strict=True)):
         thought = sum(seconds for stage, seconds in step["timings"].items() if stage != "capture")
         assert view == {"view": number, "turn": pytest.approx(thought), **step["timings"]}
+
+
+def test_a_run_says_why_its_objects_are_what_they_are(kept_run, capsys):
+    first, second = [o.id for o in read_run(kept_run).graph.objects if o.role == "object"][:2]
+    assert run_command("why", kept_run, first, second, "--json") == 0
+    two, one = json.loads(capsys.readouterr().out)["options"]
+    assert one["what"].startswith("one: a ")
+    assert two["total"] == pytest.approx(two["points"] + two["free"] + two["parameters"] + two["border"])
+    assert run_command("why", kept_run, first) == 0
+    assert f"{first}: costs in nats" in capsys.readouterr().out
+    assert run_command("why", kept_run) == 1
+    assert "give one, or two" in capsys.readouterr().err

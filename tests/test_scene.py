@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numba
 import numpy as np
@@ -23,6 +24,7 @@ from caryatid.errors import InputError, PerceptionError
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry import transforms
+from caryatid.io.bop import read_recording
 from caryatid.io.graph_json import graph_text
 from caryatid.scene import Scene
 from caryatid.sensing.clouds import average_pixels
@@ -406,3 +408,30 @@ def test_what_a_copy_learns_the_original_does_not(method, segmentation):
     )
     np.testing.assert_array_equal(copied.labels, alone.labels)
     np.testing.assert_array_equal(copied.cloud.points_world, alone.cloud.points_world)
+
+
+@pytest.fixture(scope="module")
+def sample_auto():
+    scene = Scene(segmentation="auto")
+    for view in read_recording("sample-recording"):
+        scene.update(view)
+    return scene
+
+
+def test_the_terms_of_an_object_add_up_and_nothing_that_pays_is_left(sample_auto):
+    scene = sample_auto
+    ids = [o.id for o in scene.graph.objects if o.role == "object"]
+    assert len(ids) > 7
+    for id_ in ids:
+        chosen, *others = scene.why(id_).options
+        terms = (chosen.points, chosen.free, chosen.parameters, chosen.border, chosen.others)
+        assert chosen.total == pytest.approx(sum(terms))
+        assert min(other.total for other in others) > chosen.total
+    for pair in combinations(ids, 2):
+        two, one = scene.why(*pair).options
+        assert one.total > two.total
+        assert two.total >= sum(scene.why(id_).options[0].total for id_ in pair) - 1e-6
+    assert str(scene.why(ids[0])).startswith(f"{ids[0]}: a")
+    for wrong in (["o99"], [ids[0], ids[0]], ["o0"]):
+        with pytest.raises(InputError):
+            scene.why(*wrong)

@@ -30,6 +30,7 @@ from caryatid.objects.changes import ChangeDetector, appeared, describe_contradi
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed, without
 from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
+from caryatid.objects.reasons import Reasons
 from caryatid.runtime import Pictured, call
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.segmentation.diagnosis import (
@@ -176,6 +177,26 @@ class Scene(Pictured):
             supported: Id of an object.
         """
         return explain(self.graph, supporter, supported, self.config.support)
+
+    def why(self, object_id: str, other: str | None = None) -> Reasons:
+        """Say what an object's explanation costs, and what others would; or why two objects are two.
+
+        Args:
+            object_id: Id of an object, such as `o3`.
+            other: Id of another one.
+
+        Raises:
+            InputError: An object is unknown, or has no points, or both are the same.
+        """
+        ids, labels = [object_id] if other is None else [object_id, other], list[int]()
+        for id_ in ids:
+            label = self._label_of(self._object(id_).id)
+            if label is None or label not in self._models.fits:
+                raise InputError(id_, "has no points in the newest model", "ask about another object")
+            labels.append(label)
+        if len({*ids}) < len(ids):
+            raise InputError(object_id, "is the same object", "ask about two different objects")
+        return replace(self._models.reasons(labels, self.voxels), subject=tuple(ids))
 
     def predict_removal(self, object_id: str) -> tuple[Effect, ...]:
         """Predict which objects move when one is removed, with probability and reason.

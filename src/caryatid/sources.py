@@ -36,13 +36,13 @@ from caryatid.io.mask_sources import MaskSource, without_ignored
 from caryatid.io.point_clouds import read_stored_cloud
 from caryatid.robots import HUMANOID, Robot, find_robot
 from caryatid.robots.protocol import RecordingCamera, RecordingRobot
-from caryatid.scene import KEPT, LEFT_OUT
+from caryatid.scene import KEPT, LEFT_OUT, Scene
 from caryatid.sensing.views import Camera
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.sessions.session import Session, is_session
 from caryatid.simulation.scenes import is_builtin, load_scene
 from caryatid.simulation.setup import make_simulation
-from caryatid.steps import Run, RunWriter, is_run, read_run
+from caryatid.steps import Run, RunWriter, is_run, read_config, read_run, read_steps
 
 log = logging.getLogger(__name__)
 
@@ -101,6 +101,29 @@ def read_model(path: Path) -> tuple[SupportGraph, VoxelMap | None]:
         return read_run(path).graph, None
     with Session.open(path, read_only=True) as session:
         return session.graph, session.scene.voxels
+
+
+def read_scene(path: Path) -> Scene:
+    """Compute the scene model of a run again from its views, or read that of a session.
+
+    Raises:
+        InputError: It is neither, a file in it is missing or broken, or it is of a cloud or another version.
+    """
+    if is_session(path):
+        with Session.open(path, read_only=True) as session:
+            return session.scene
+    run = read_run(path)
+    options, seed = run.record["options"], run.record["seed"]
+    scene = Scene(read_config(run), segmentation=options.get("segmentation"), seed=seed)
+    for step in read_steps(run):
+        if step.view is None:
+            raise InputError(path, "is of a cloud, without views", "give a run of depth images, or a session")
+        scene.update(step.view)
+        if step.lift is not None:
+            scene.removed(step.lift.object_id)
+    if scene.graph.to_networkx().edges != run.graph.to_networkx().edges:
+        raise InputError(path, "gives another graph with this version", "extract or explore again")
+    return scene
 
 
 @contextmanager

@@ -273,6 +273,23 @@ class Describe(options.Command, work="results:describe_model"):
     """Run folder, session, or graph.json."""
 
 
+class Why(options.Command, work="results:tell_reasons"):
+    """Say why an object has its shape, or why two objects are two: what each explanation costs.
+
+    Costs are in nats, and their terms add up; the explanation in use comes first. A run is computed
+    again from its views.
+
+    Usage examples:
+      caryatid why run o3
+      caryatid why run o3 o5
+    """
+
+    run: options.RunPath
+    """Run folder or session."""
+    objects: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="ID [ID]")]
+    """One or two ids of objects."""
+
+
 class Export(options.Command, work="results:export_model"):
     """Export the scene model of a run to simulators, 3D viewers, motion and task planners, and graph tools.
 
@@ -516,7 +533,7 @@ class Completion(options.Command, work="commands:print_completion"):
 COMMANDS: dict[str, type[options.Command | Session]] = {
     command.__name__.lower(): command
     for command in (
-        Demo, Check, Explore, Extract, View, Evaluate, Order, Clear, Import, Report, Describe, Export,
+        Demo, Check, Explore, Extract, View, Evaluate, Order, Clear, Import, Report, Describe, Why, Export,
         Benchmark, Session, Serve, Scenes, Config, Completion,
     )
 }  # fmt: skip

@@ -16,7 +16,7 @@ from caryatid.benchmark.running import run_locally, run_on_cluster
 from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES, change_suite
 from caryatid.cli import NOT_SAFE
-from caryatid.cli.commands import Benchmark, Check, Describe, Evaluate, Export, Import, Order, Report
+from caryatid.cli.commands import Benchmark, Check, Describe, Evaluate, Export, Import, Order, Report, Why
 from caryatid.cli.output import kept, table
 from caryatid.config import Config
 from caryatid.errors import InputError, needs_extra
@@ -29,7 +29,7 @@ from caryatid.manipulation.order import plan_order
 from caryatid.runtime import fingerprint
 from caryatid.runtime.parallel import cores
 from caryatid.segmentation.diagnosis import diagnose
-from caryatid.sources import kind_of, open_run, read_model
+from caryatid.sources import kind_of, open_run, read_model, read_scene
 from caryatid.steps import read_config, read_steps
 from caryatid.viz.check_report import SHOWN, make_check_report
 from caryatid.viz.report import make_report, print_pdf, read_lift, render_html
@@ -166,6 +166,20 @@ def export_model(command: Export) -> None:
 def describe_model(command: Describe) -> None:
     text = describe(read_model(command.run)[0])
     command.output.result({"text": text}, text)
+
+
+def tell_reasons(command: Why) -> None:
+    if len(command.objects) not in (1, 2):
+        given = count_of(len(command.objects), "id")
+        raise InputError("ID", f"{given} of objects given", "give one, or two to ask why they are two")
+    with command.output.working("looking at all views again"):
+        reasons = read_scene(command.run).why(*command.objects)
+    terms = ("points", "free", "parameters", "border", "others", "total")
+    rows = [[option.what, *(f"{getattr(option, term):.0f}" for term in terms)] for option in reasons.options]
+    heads = ["explanation", "points", "free\nspace", "parameters", "border", "colours,\nviews", "total"]
+    title = f"{' and '.join(reasons.subject)}: costs in nats, the explanation in use first"
+    notes = "".join(f"{option.what}: {option.note}\n" for option in reasons.options if option.note)
+    command.output.result(reasons.to_json(), table(title, heads, rows, figures=True), notes)
 
 
 def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:

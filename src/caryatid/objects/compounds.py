@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +69,7 @@ class Revolution:
     axis: Array
     ends: Array
     outward: Array
+    kind: ClassVar = "body of revolution"
 
     @property
     def parameters(self) -> int:
@@ -241,6 +243,7 @@ class OpenBox:
     """
 
     slabs: tuple[Box, ...]
+    kind: ClassVar = "open box"
 
     @property
     def parameters(self) -> int:

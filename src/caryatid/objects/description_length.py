@@ -192,15 +192,20 @@ def _cost(
     Space is not checked if the cost without it already exceeds a limit [nats].
     """
     cost = float(point_costs(shape, evidence, config).sum()) * evidence.weight + price(shape, config)
-    if shape is None or evidence.voxels is None or cost >= below:
-        return cost
+    return cost if cost >= below else cost + free_cost(shape, evidence, config)
+
+
+def free_cost(shape: Shape | Compound | None, evidence: Evidence, config: ExplanationConfig) -> float:
+    """Cost [nats] of the space seen free inside a shape."""
+    if shape is None or evidence.voxels is None:
+        return 0.0
     if not isinstance(shape, Shape):
-        return cost + config.free_cost * shape.free(evidence.voxels)
+        return config.free_cost * shape.free(evidence.voxels)
     # A surface voxel may be half free.
     inset = max(1.2 * evidence.voxels.config.size, 3.0 * evidence.noise)
     if isinstance(shape, Box) and shape.extents.min() <= 2.0 * inset:
-        return cost + config.free_cost * free_in_slab(shape, evidence.voxels)
-    return cost + config.free_cost * free_inside(shape, evidence.voxels, inset)[1]
+        return config.free_cost * free_in_slab(shape, evidence.voxels)
+    return config.free_cost * free_inside(shape, evidence.voxels, inset)[1]
 
 
 def explain(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -48,14 +48,21 @@ class TwoObjects:
     Attributes:
         second: Which points (N,) are the second's.
         explanations: Of both.
-        cost: Cost of both and of the border between them, with the evidence of colours and views [nats].
+        border: Cost of the border between them [nats].
+        others: Evidence of colours and views against two [nats].
         by_colour: Whether their colours alone pay for another object.
     """
 
     second: Mask
     explanations: tuple[Explanation, Explanation]
-    cost: float
+    border: float
+    others: float
     by_colour: bool
+
+    @property
+    def cost(self) -> float:
+        """Cost of both and of being two [nats]."""
+        return self.explanations[0].cost + self.explanations[1].cost + self.border + self.others
 
 
 def split(
@@ -110,11 +117,11 @@ def _parts(
     no shape are not objects.
     """
     own = evidence.select(index)
-    found = _best_two(own, whole, index, hints, config, rng)
-    if found is None:
+    found = best_division(own, whole, [h[index] for h in hints], config, rng)
+    if found is None or found.cost >= whole.cost:
         return None
     parts: list[tuple[Groups, float]] = []
-    border = found.cost - sum(e.cost for e in found.explanations)
+    border = found.border + found.others
     for side, explanation in zip((~found.second, found.second), found.explanations, strict=True):
         further = _parts(evidence, explanation, index[side], hints, config, rng)
         if not (found.by_colour or further or explained(explanation, own.select(side), config.explanation)):
@@ -124,15 +131,22 @@ def _parts(
     return parts if compound.shape is None else None
 
 
-def _best_two(
+def best_division(
     evidence: Evidence,
     whole: Explanation,
-    index: Groups,
     hints: Sequence[Mask],
     config: Config,
     rng: np.random.Generator,
 ) -> TwoObjects | None:
-    """Best division of points (those with this index among all) into two objects; None if one is better."""
+    """Find the best division of points into two objects; None if none can cost less than one.
+
+    Args:
+        evidence: The points.
+        whole: Their best explanation as one object.
+        hints: Points (N,) that may be an object of their own.
+        config: What is tried, what it costs, and how shapes are fitted.
+        rng: Source of the samples.
+    """
     costs = config.explanation
     if len(evidence) < 2 * config.split.min_points:
         return None
@@ -141,8 +155,7 @@ def _best_two(
     misfit = own[near].mean(axis=1)
     excess = float(np.maximum(misfit - costs.usual, 0.0).sum()) * evidence.weight
     free = whole.cost - price(whole.shape, costs) - float(own.sum()) * evidence.weight
-    starts = [h[index] for h in hints]
-    starts = [h for h in starts if h.any() and not h.all()]
+    starts = [h for h in hints if h.any() and not h.all()]
     hinted = len(starts)
     colours = max((_colours(evidence, start, costs) for start in starts), default=0.0)
     if excess + free + colours < costs.parameter_cost * min(kind.parameters for kind in KINDS.values()):
@@ -154,12 +167,8 @@ def _best_two(
     tried = sorted(sorted(shaped, key=shaped.__getitem__)[:2])
     hinted = sum(k < hinted for k in tried)
     settled = _settled(evidence, [starts[k] for k in tried], hinted, near, config, rng)
-    better = [
-        two
-        for two in settled.values()
-        if two.cost < whole.cost and (two.by_colour or not _is_layer(evidence, two))
-    ]
-    return min(better, key=lambda two: two.cost, default=None)
+    proper = [two for two in settled.values() if two.by_colour or not _is_layer(evidence, two)]
+    return min(proper, key=lambda two: two.cost, default=None)
 
 
 def _colours(evidence: Evidence, second: Mask, costs: ExplanationConfig) -> float:
@@ -224,9 +233,10 @@ def _settled(
     settled: dict[int, TwoObjects] = {}
     for k, pair in explained_sides(first_look):
         gain = _colours(evidence, seconds[k], config.explanation) if k < hinted else 0.0
-        total = pair[0].cost + pair[1].cost + _border(evidence, seconds[k], near, config)
-        total += unity(evidence, seconds[k], config.explanation) - gain
-        settled[k] = TwoObjects(seconds[k], pair, total, gain > price(None, config.explanation))
+        border = _border(evidence, seconds[k], near, config)
+        others = unity(evidence, seconds[k], config.explanation) - gain
+        pays = gain > price(None, config.explanation)
+        settled[k] = TwoObjects(seconds[k], pair, border, others, pays)
     return settled
 
 
@@ -329,7 +339,12 @@ def best_merge(
             pairs.append((a, b))
     sizes = {k: len(known[k][0]) for k in labels}
     best, most = None, 0.0
-    gains = on_threads(lambda number: _gain(known, pairs[number], config, seed), len(pairs))
+
+    def gain_of(number: int) -> float:
+        pair = pairs[number]
+        return compare([known[k] for k in pair], config, np.random.default_rng([seed, *pair])).gain
+
+    gains = on_threads(gain_of, len(pairs))
     for (a, b), gain in zip(pairs, gains, strict=True):
         if gain <= 0.0:
             apart[a, b] = sizes[a] + sizes[b]
@@ -351,38 +366,47 @@ def _gaps(evidence: Sequence[Evidence], costs: ExplanationConfig) -> Array:
     return np.where(alike, longer, costs.reach)
 
 
-def _gain(
-    known: Mapping[int, tuple[Evidence, Explanation]], labels: Pair, config: Config, seed: int
-) -> float:
-    """How much less [nats] one object costs than two, by their shapes, a joint fit, and colours.
+@dataclass(frozen=True, eq=False, slots=True)
+class Comparison:
+    """Two objects, and one in their place.
 
-    Zero if the joint shape leaves one of the two unexplained, or if there is none: prefer two objects until
-    the evidence for one is clear.
+    Attributes:
+        alone: Cost of the two by their own shapes [nats].
+        border: Cost of the border between the two [nats].
+        one: The best explanation of all their points.
+        colours: Evidence [nats] of colours for two, or, if negative, for one.
     """
-    costs, rng = config.explanation, np.random.default_rng([seed, *labels])
-    pair = [known[label] for label in labels]
-    (first, alone), (second, other) = pair
+
+    alone: float
+    border: float
+    one: Explanation
+    colours: float
+
+    @property
+    def gain(self) -> float:
+        """How much less one object costs than two [nats]; 0 if no shape explains both."""
+        gain = self.alone + self.border - self.one.cost - self.colours
+        return max(gain, 0.0) if self.one.shape is not None else 0.0
+
+
+def compare(
+    pair: Sequence[tuple[Evidence, Explanation]], config: Config, rng: np.random.Generator
+) -> Comparison:
+    """Compare two objects, each with its best explanation, with one: by shapes, a joint fit, and colours."""
+    costs, ((first, alone), (second, other)) = config.explanation, pair
     both = first.joined(second)
-    of_second, apart = np.arange(len(both)) >= len(first), alone.cost + other.cost
-    cost_of_two = apart + _border(both, of_second, _neighbours(both.points), config)
+    of_second = np.arange(len(both)) >= len(first)
+    apart = alone.cost + other.cost
+    border = _border(both, of_second, _neighbours(both.points), config)
     one = best_explanation([e.shape for e in (alone, other) if e.shape is not None], both, costs)
     for first_look in (True, False):
         one = min(one, explain(both, costs, config.fit, rng, first_look=first_look), key=lambda e: e.cost)
-        if one.cost > cost_of_two + price(None, costs):
+        if one.cost > apart + border + price(None, costs):
             break
-    colours = colour_evidence(first, second, costs)
-    gain = 0.0 if one.shape is None else cost_of_two - one.cost - colours
-    most = costs.irregular
-    if not all(isinstance(e.shape, Shape) and explained(e, own, costs) for own, e in pair):
-        # A compound has creases of its own: to it a border without one means nothing.
-        compound = best_compound(both, config, apart - colours - max(gain, 0.0))
-        if compound.shape is not None:
-            one, gain, most = compound, apart - colours - compound.cost, costs.usual
-    if gain <= 0.0:
-        return 0.0
-    cost = point_costs(one.shape, both, costs)
-    is_one = max(cost[of_second].mean(), cost[~of_second].mean()) <= most
-    return gain if is_one else 0.0
+    found = Comparison(apart, border, one, colour_evidence(first, second, costs))
+    # A compound has creases of its own: to it a border without one means nothing.
+    compound = best_compound(both, config, apart - found.colours - found.gain)
+    return found if compound.shape is None else replace(found, border=0.0, one=compound)
 
 
 def _neighbours(points: Array) -> Groups:

@@ -31,6 +31,7 @@ from caryatid.objects.description_length import (
     plain_colour,
 )
 from caryatid.objects.model_selection import GROWTH, best_merge, split
+from caryatid.objects.reasons import Reasons, explain_object, explain_pair
 from caryatid.objects.solids import as_solid
 from caryatid.runtime.parallel import on_threads
 from caryatid.segmentation.observation import Observation
@@ -473,6 +474,25 @@ class ObjectModels:
         """The objects in the order of their labels: as solids, or with the primitives fitted to them."""
         return [self._solids.get(k, self.fits[k]) for k in sorted(self.fits)]
 
+    def reasons(self, labels: Sequence[int], voxels: VoxelMap | None) -> Reasons:
+        """Why an object is what it is, or why two are two.
+
+        Args:
+            labels: One or two labels of objects that have a shape.
+            voxels: Space seen free.
+        """
+        noise, names = self._noise(), tuple(map(object_id, labels))
+        rng = np.random.default_rng([self._seed, *labels])
+        known = [self._explained(k, noise, voxels, compound=True) for k in labels]
+        if len(known) == 2:
+            return explain_pair(names, known, frozenset(labels) in self._distinct, self._config, rng)
+        evidence, explanation = known[0]
+        if labels[0] in self._solids:  # which draws a compound too
+            compound = explanation.shape if not isinstance(explanation.shape, Shape) else None
+            shapes = [] if compound is None else [compound]
+            explanation = best_explanation(shapes, evidence, self._config.explanation)
+        return explain_object(names[0], explanation, evidence, self._config, rng)
+
     def _explained(
         self, label: int, noise: float, voxels: VoxelMap | None, *, compound: bool = False
     ) -> tuple[Evidence, Explanation]:
@@ -510,10 +530,10 @@ class ObjectModels:
         self._owners = {k: known for k, known in self._owners.items() if k not in labels}
 
     def _noise(self) -> float:
-        """Standard deviation of points from their surfaces [m]: that of the object in the middle."""
+        """Standard deviation of points from their surfaces [m]: the median of those that are primitives."""
         # 1.25 mean absolute values of a normal distribution are one standard deviation; registration leaves
         # 2 mm at the least.
-        residuals = [o.residual for o in self.objects()]
+        residuals = [o.residual for k, o in self.fits.items() if k not in self._solids]
         return max(1.25 * float(np.median(residuals)), 0.002) if residuals else 0.002
 
     def _fit(

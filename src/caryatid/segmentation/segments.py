@@ -100,8 +100,6 @@ def segment(
     if odds is not None:
         part = _with_share(part, overhang | (odds[-1][samples.places] > 0.0), 0.5)
     part = merge_occluded(samples, part, config, fit_config, rng)
-    # Readings of the surface with a common error exceed the clearance, but not by twice as much.
-    part = _with_share(part, overhang | (samples.height > 2.0 * config.clearance), 0.05)
     labels[samples.grid] = image = samples.image(part)
     if view.rgb is not None:
         apart = divided(image, uncut, facing, seam, width)
