@@ -73,7 +73,8 @@ class Exploration:
 
     def _opened(self) -> Session:
         """The session, which is created if it does not exist."""
-        folder, own, s = self._settings.session, (self._config, self._settings.seed), self._settings
+        folder, s = Path(self._settings.session).expanduser(), self._settings
+        own = self._config, s.seed
         try:
             return Session.begin(folder, own[0], seed=own[1], planner=s.planner, robot=s.robot)
         except SessionConflictError:
@@ -97,7 +98,7 @@ class Exploration:
             self._replace(self.scene)
             return self.graph
         if self._session is not None:
-            folder, number = Path(self._settings.session), 1
+            folder, number = Path(self._settings.session).expanduser(), 1
             while (aside := folder.with_name(f"{folder.name}.{number}")).exists():
                 number += 1
             folder.rename(aside)
@@ -123,7 +124,9 @@ class Exploration:
         rectified = self._settings.rectified or is_rectified(self._settings.depth_topic)
         view = messages.view_of(depth, info, others.get("colour"), T_world_camera, rectified=rectified)
         if self._settings.ignore:
-            view = without_ignored(view, Path(self._settings.ignore), self._config.recording.max_pixels)
+            view = without_ignored(
+                view, Path(self._settings.ignore).expanduser(), self._config.recording.max_pixels
+            )
         if "masks" in others:
             frames = {self._settings.world_frame: np.eye(4), depth.header.frame_id: T_world_camera}
             view = messages.with_masks(view, others["masks"], frames)

@@ -29,7 +29,7 @@ STILL = 0.2
 """Time before a view in which the camera must not have moved [s]."""
 BEAT, SILENT = 0.5, 3.5
 """Time between two signs of life that the client must acknowledge, and how long it may not do so [s]."""
-OLD = 1.0
+STALE = 1.0
 """Age of a transform that no longer says where the camera is, and longest step of a clock that counts [s]."""
 CANCELLED = "cancelled"
 """Why a goal ended that its client cancelled."""
@@ -139,7 +139,7 @@ class Goal:
         distance, angle = _between(there.translation, there.rotation, pose.position, pose.orientation)
         if distance <= s.position_tolerance and angle <= s.angle_tolerance:
             return True
-        if (age := self._age(self._frame)) > OLD:
+        if (age := self._age(self._frame)) > STALE:
             reason = f"is {age:.1f} s old, so that nobody knows where the camera is"
             source = f"transform {s.world_frame} ← {self._frame}"
             return InputError(source, reason, "check what publishes it, and its clock")
@@ -229,7 +229,7 @@ class Goal:
             if found is not None and not isinstance(found, InputError):
                 return found
             if now != before:
-                passed = min(max(now - before, 0.0), OLD)  # a clock that was set tells nothing
+                passed = min(max(now - before, 0.0), STALE)  # a clock that was set tells nothing
                 waited, before, moved = waited + passed, now, time.monotonic()
             if time.monotonic() - moved > seconds:
                 remedy = "publish /clock, or set use_sim_time to false"

@@ -100,7 +100,7 @@ class ExplorationNode(Node):
         self.scene_thread = ThreadPoolExecutor(1)
         self._markers: list[Any] = []
         self.tell_stage("starting")
-        self.create_timer(BEAT, self._beat)
+        self.create_timer(BEAT, self._publish_diagnostics)
         self.prepared = self.scene_thread.submit(self._prepare)
         self._info: Any = None
         info = self._listened["info"][0]
@@ -148,7 +148,7 @@ class ExplorationNode(Node):
         self.publish("stage", String(data=text))
         self._status = DiagnosticStatus(level=level, name=f"{self.get_name()}: exploration", message=text)
 
-    def _beat(self) -> None:
+    def _publish_diagnostics(self) -> None:
         now = DiagnosticArray(status=[self._status])
         now.header.stamp = self.get_clock().now().to_msg()
         self.publish("/diagnostics", now)
