@@ -403,6 +403,11 @@ def compare(
         one = min(one, explain(both, costs, config.fit, rng, first_look=first_look), key=lambda e: e.cost)
         if one.cost > apart + border + price(None, costs):
             break
+    if isinstance(one.shape, Shape):
+        # Points that no shape explains are near the object; what stands out from it is another one.
+        beyond = np.abs(one.shape.signed_distance(both.points)) / costs.reach - 1.0
+        stray = costs.outlier * both.weight * float(np.maximum(beyond, 0.0).sum())
+        one = replace(one, cost=one.cost + stray)
     found = Comparison(apart, border, one, colour_evidence(first, second, costs))
     # A compound has creases of its own: to it a border without one means nothing.
     compound = best_compound(both, config, apart - found.colours - found.gain)
