@@ -81,6 +81,15 @@ def test_a_fault_is_named_with_its_remedy(sound, said):
     assert any(re.search(said, problem) for problem in problems), problems
 
 
+@pytest.mark.parametrize("factor", [0.7, 1.25])
+def test_focal_lengths_are_right_once_multiplied(sound, factor):
+    spoilt = [replace(view, K=view.K * [[factor, 1, 1], [1, factor, 1], [1, 1, 1]]) for view in sound]
+    remedy = re.search(r"multiply the focal lengths by ([\d.]+)", diagnose(spoilt, Config()).problems[0])
+    f = float(remedy[1])
+    mended = [replace(view, K=view.K * [[f, 1, 1], [1, f, 1], [1, 1, 1]]) for view in spoilt]
+    assert diagnose(mended, Config()).problems == []
+
+
 def test_the_report_says_what_is_wrong_above_the_pictures(sound, tmp_path, capsys):
     write_recording(tmp_path / "spoilt", [FAULTS["is the inverse"](view) for view in sound])
     assert run_command("check", tmp_path / "spoilt", "--report", tmp_path / "check.html") == 1

@@ -150,6 +150,8 @@ class ResultStore:
         try:
             lines = iter(self._log)
             about = parse_json(dict[str, dict[str, str]], next(lines), self.path)["about"]
+            if "fingerprint" not in about:
+                raise LookupError
             for line in lines:
                 if "suite" in line:
                     plan = parse_json(_Plan, line, self.path)

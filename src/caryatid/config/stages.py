@@ -40,6 +40,9 @@ def _few_voxels(extent: tuple[float, float, float], info: ValidationInfo) -> tup
 
 Positive = Annotated[float, Field(gt=0, le=1e18)]
 NotNegative = Annotated[float, Field(ge=0, le=1e18)]
+Length = Annotated[float, Field(gt=0, le=1000)]
+"""More would be no room, and its square beside that of the smallest error of depth lose digits."""
+Distance = Annotated[float, Field(ge=0, le=1000)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Likelihood = Annotated[float, Field(gt=0, lt=1)]
 """A probability that is neither impossible nor certain: its odds are finite."""
@@ -55,8 +58,10 @@ Most = Annotated[int, Field(ge=1, le=1_000_000_000)]
 """A limit on what a machine can hold."""
 Repeats = Annotated[int, Field(ge=0, le=1000)]
 """Number of times something is tried or repeated; more would take minutes per view."""
-Lengths = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
+Lengths = Annotated[tuple[Length, Length], AfterValidator(_rising)]
 """Smallest and largest length."""
+Range = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
+"""Smallest and largest value."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -65,21 +70,21 @@ class CloudConfig:
 
     max_coordinate: Positive = 1e4
     """Maximum depth [m]; larger values mean wrong units."""
-    max_depth: Positive = 3.0
+    max_depth: Length = 3.0
     """Readings beyond this depth are dropped [m]; the paper's working range."""
-    min_depth: NotNegative = 0.1
+    min_depth: Distance = 0.1
     """Readings nearer than this are dropped [m]; the robot's hand, or below any sensor's range."""
     normal_window: Count = 7
     """Maximum side of the window in which normals are fitted [px]; 7 × 7 reduces the noise to a quarter."""
-    normal_size: Positive = 0.02
+    normal_size: Length = 0.02
     """Side of that window on the surface, at the median distance [m]: 7 px at 1.5 m with f = 525 px; fewer
     in coarse images, where 7 px would span an object."""
-    edge_jump: NotNegative = 0.01
+    edge_jump: Distance = 0.01
     """A larger depth step between neighbouring pixels separates two surfaces [m]; at 1 m, grows with z²."""
     max_slope: NotNegative = 0.004
     """Change of inverse depth allowed within one surface in addition to edge_jump [1/m per px]; a tilt of 80°
     at 2.7 m with f = 525 px. Grows with pixel size in coarser images."""
-    voxel: Positive = 0.005
+    voxel: Length = 0.005
     """Spacing of an object's points, pooled over views [m]; about the noise of one reading at 1.5 m."""
     views: Count = 10
     """Number of views whose points and segments are all kept [1]."""
@@ -93,21 +98,21 @@ class CloudConfig:
 class SurfaceConfig:
     """The support surface (table top)."""
 
-    tolerance: Positive = 0.01
+    tolerance: Length = 0.01
     """Distance within which a point belongs to the plane [m]; 3σ of the sensor at 1.8 m."""
     max_tilt: Angle = 10.0
     """Maximum angle between its normal and the vertical, if the view has a pose [deg]."""
     max_deviation: Angle = 25.0
     """Maximum angle between the normals of a point and its plane [deg]; 3σ of normals from depth."""
-    gap: Positive = 0.3
+    gap: Length = 0.3
     """Regions of one plane farther apart than this are two surfaces [m]; occlusion shadows are narrower."""
-    min_width: NotNegative = 0.24
+    min_width: Distance = 0.24
     """Minimum width of furniture [m]; a large hand spans as much, and holds no object that is wider."""
     min_points: Count = 200
     """Minimum number of inliers of a table [points]; a tenth of `min_area` at 5 mm."""
-    search: Positive = 0.05
+    search: Length = 0.05
     """Maximum change in height of a known table between views [m]; 5σ of registration and tilt."""
-    spacing: Positive = 0.02
+    spacing: Length = 0.02
     """Spacing of the table's points kept for later views [m]; fine enough for its outline."""
 
 
@@ -117,15 +122,15 @@ class RegistrationConfig:
 
     enabled: bool = True
     """Whether poses are refined, and changes between views detected."""
-    translation: Positive = 0.01
+    translation: Length = 0.01
     """Expected error of a reported position, per axis [m]; about twice the usual error."""
     rotation: Positive = 0.5
     """Expected error of a reported orientation, per axis, about the camera [deg]."""
     noise: Annotated[float, Field(ge=1e-6, le=1e18)] = 0.001
     """Expected point-to-plane distance of two matched patches, beyond the noise of their readings [m]."""
-    spacing: Positive = 0.01
+    spacing: Length = 0.01
     """Size of the patches on objects, over which readings are averaged [m]; a dozen pixels at 1.5 m."""
-    spacing_far: Positive = 0.03
+    spacing_far: Length = 0.03
     """Size of the patches on the support surface [m]."""
     sample: Count = 600
     """Number of patches of a view that are matched with each other view [1]."""
@@ -135,7 +140,7 @@ class RegistrationConfig:
     """Minimum number of matches that determine a pose [1]."""
     kept: Count = 12
     """Number of earlier views that a new one is registered to; they move too [1]. 30° apart on a circle."""
-    max_translation: NotNegative = 0.1
+    max_translation: Distance = 0.1
     """Maximum correction of a position [m]; a larger one is rejected."""
     max_rotation: Angle = 5.0
     """Maximum correction of an orientation [deg]; a larger one is rejected."""
@@ -150,37 +155,37 @@ class SegmentationConfig:
 
     stride: Count = 2
     """Pixels between samples of the organised image; 2 keeps 6 mm at 1.5 m. 1 in images below 320 px."""
-    margin: NotNegative = 0.05
+    margin: Distance = 0.05
     """Points farther than this outside the support surface's outline belong to no object [m]."""
-    edge_jump: Positive = 0.006
+    edge_jump: Length = 0.006
     """Distance of a sample from its neighbour's plane that separates surfaces [m]; at 1 m, grows with z²."""
-    surfel: Positive = 0.015
+    surfel: Length = 0.015
     """Size of the surfels whose edges are classified as convex or concave [m]; 4σ of the noise at 1.5 m."""
     crease: NotNegative = 4.0
     """Length that a change of the normal by 90° adds to a path on the surface [surfels]."""
-    step: NotNegative = 0.0035
+    step: Distance = 0.0035
     """Surfels more than this above their neighbour's plane are another layer [m]; 2σ after smoothing."""
-    reach: Positive = 0.012
+    reach: Length = 0.012
     """Maximum distance of connected points in an unorganised cloud [m]; twice the usual spacing."""
     concavity: Angle = 15.0
     """Angle between normals above which a concave edge separates two surfaces [deg]; LCCP's 10 plus noise."""
-    rise: NotNegative = 0.01
+    rise: Distance = 0.01
     """Two places of a segment are concave if one lies this far above the other's tangent plane [m]."""
     min_area: NotNegative = 0.0011
     """Minimum area of a segment [m²]; noise at depth edges and shiny surfaces leaves smaller ones."""
-    min_width: NotNegative = 0.02
+    min_width: Distance = 0.02
     """A segment narrower than this beside larger ones belongs to one [m]; noise rounds creases by as much."""
     alike: Share = 0.3
     """Affinity above which samples attract each other [1]: 0 undecided, 1 certain; 0.3 is 65 % likely."""
-    merge_gap: NotNegative = 0.25
+    merge_gap: Distance = 0.25
     """Maximum length hidden by a nearer object across which two segments are merged [m]."""
-    clearance: NotNegative = 0.008
+    clearance: Distance = 0.008
     """Points nearer than this to the support surface belong to it [m]; 2σ of the sensor at 1.5 m."""
-    max_height: Positive = 0.6
+    max_height: Length = 0.6
     """Points higher than this above the table belong to no object [m]; size of table-top objects."""
     overlap: Share = 0.3
     """Minimum share of a segment's points on an object for the two to be associated [1]."""
-    overlap_reach: NotNegative = 0.02
+    overlap_reach: Distance = 0.02
     """Maximum distance of a point that lies on an object [m]; 2σ of both views' registration error."""
 
 
@@ -212,27 +217,27 @@ class FitConfig:
     points."""
     min_points: Count = 12
     """Minimum number of points of an object [1]; a box has nine parameters."""
-    threshold: Positive = 0.01
+    threshold: Length = 0.01
     """MSAC truncation of the distance to the surface [m]; 2σ of registration error."""
     polish: Annotated[Repeats, Field(ge=1)] = 3
     """Number of best hypotheses per shape that least squares refines [1]."""
     steps: Repeats = 25
     """Maximum number of least-squares steps [1]."""
-    max_extent: Positive = 0.5
+    max_extent: Length = 0.5
     """Maximum extent of a shape [m]; table-top objects."""
     min_extent: Annotated[float, Field(gt=0, le=1)] = 0.008
     """Minimum extent of a shape [m]; below the sensor's resolution."""
-    max_radius: Positive = 0.15
+    max_radius: Length = 0.15
     """Maximum radius of a cylinder or sphere [m]."""
-    normal_weight: NotNegative = 0.004
+    normal_weight: Distance = 0.004
     """Cost of a normal that is wrong by 90°, in model selection [m]: half the registration error."""
-    correlated: Positive = 4.0
+    correlated: Factor = 4.0
     """Number of neighbouring points that share one error [1]; depth is smoothed over 2 × 2 pixels."""
-    registration: NotNegative = 0.002
+    registration: Distance = 0.002
     """Standard deviation of registration [m]; more points do not average it out."""
-    rim: NotNegative = 0.003
+    rim: Distance = 0.003
     """Standard deviation of the border of a point set at a depth edge [m]: one pixel at 1.5 m."""
-    max_residual: Positive = 0.008
+    max_residual: Length = 0.008
     """Maximum mean distance of points to their shape [m]; a worse shape is marked `poor_fit`."""
 
 
@@ -270,9 +275,9 @@ class ExplanationConfig:
     """Cost of a voxel inside a shape that is observed free [nats]; four outliers at 5 mm spacing."""
     usual: NotNegative = 0.9
     """Maximum mean cost of a well explained neighbourhood of points [nats]; holds for 9 in 10 true shapes."""
-    spacing: Positive = 0.008
+    spacing: Length = 0.008
     """Spacing to which points are downsampled [m]; a third of the area that shares one error."""
-    reach: Positive = 0.03
+    reach: Length = 0.03
     """Maximum gap between objects to merge [m]; the width of an occlusion shadow."""
 
 
@@ -284,7 +289,7 @@ class CompletionConfig:
     """Whether unseen faces are extended."""
     max_tilt: Angle = 30.0
     """Maximum angle between an unseen face's normal and straight down [deg]; only such faces bear weight."""
-    overlap: NotNegative = 0.004
+    overlap: Distance = 0.004
     """Maximum overlap of the extended face, or its walls, with another shape [m]; the fits' uncertainty."""
     max_free: Share = 0.15
     """Maximum share of the face's rim in voxels observed free [1]; half of one side of four."""
@@ -296,7 +301,7 @@ class PlausibilityConfig:
 
     rounds: Repeats = 3
     """Maximum number of corrections [1]; 0 leaves shapes as fitted."""
-    touch: NotNegative = 0.001
+    touch: Distance = 0.001
     """Maximum gap or overlap of two shapes in contact [m]; round edges, soft surfaces."""
     sigmas: NotNegative = 3.0
     """Maximum gap that the fits' uncertainty explains, in standard deviations [1]."""
@@ -306,17 +311,17 @@ class PlausibilityConfig:
 class SupportConfig:
     """Support relations, section III-A."""
 
-    contact_margin: NotNegative = 0.005
+    contact_margin: Distance = 0.005
     """Maximum gap of two shapes in contact if `stability` is `area` [m]; 2.5σ of a fit."""
-    reach: NotNegative = 0.012
+    reach: Distance = 0.012
     """Maximum gap of two shapes that may touch, or that an object tips across [m]; 2.5σ of the gap."""
     max_tilt: Angle = 75.0
     """Maximum tilt of the separating plane of a support from below [deg]; from there on, objects lean."""
-    patch_depth: NotNegative = 0.003
+    patch_depth: Distance = 0.003
     """Surfaces within this distance of the first contact also touch [m]; noise of one reading at 1.5 m."""
     min_area_ratio: Share = 0.1
     """r_s,min of eq. 1 [1]."""
-    overhang: NotNegative = 0.003
+    overhang: Distance = 0.003
     """An object tips if its centre of mass is this far outside the support polygon [m]; 1σ of a fit."""
     stability: Literal["area", "balance"] = "balance"
     """What decides: separating planes and r_s of eq. 1 (`area`, the paper's rules; everything on top of an
@@ -329,13 +334,13 @@ class SupportConfig:
     """Acceleration below which an object is at rest in a sample [g]: it closes a gap of at most 2 mm."""
     unexplained: Share = 0.1
     """Weight of a sample for an object not at rest in it [1]: how often an unseen object supports one."""
-    friction: Lengths = (0.4, 1.0)
+    friction: Range = (0.4, 1.0)
     """Range of sliding friction that objects are sampled from [1]: wood on cardboard to rubber on glass."""
-    density: Lengths = (100.0, 8000.0)
+    density: Range = (100.0, 8000.0)
     """Range of density that objects are sampled from [kg/m³]: half-empty packets to steel."""
-    touch: Positive = 0.0005
+    touch: Length = 0.0005
     """Standard deviation of the gap of two shapes in contact [m]; round edges, soft surfaces."""
-    max_drop: NotNegative = 0.04
+    max_drop: Distance = 0.04
     """Maximum hidden gap between an unsupported object and its supporter [m]; 0 leaves it unsupported."""
 
 
@@ -349,13 +354,13 @@ class FusionConfig:
     """Match vertices by their points or, as in the paper, by shape, pose and extent."""
     masks: MaskIdentity = "scene"
     """A mask's number identifies an object in all views (`scene`) or a segment of one view (`per-view`)."""
-    max_distance: NotNegative = 0.05
+    max_distance: Distance = 0.05
     """Maximum distance between centres of one object, plus half the smaller object's size [m]."""
     max_angle: Angle = 20.0
     """Maximum angle between axes of one object [deg], up to the shape's symmetry."""
     max_ratio: Factor = 1.6
     """Maximum ratio between sorted extents of one object [1]."""
-    settled: NotNegative = 0.005
+    settled: Distance = 0.005
     """A shape that moves, grows or turns by less than this is unchanged [m]; σ of registration error."""
     keep_share: Share = 0.5
     """Minimum occurrences / opportunities of a support to keep [1]; 0 is the union of Table I."""
@@ -365,7 +370,7 @@ class FusionConfig:
 class VoxelConfig:
     """The voxel map for occlusion tests."""
 
-    size: Positive = 0.01
+    size: Length = 0.01
     """Edge of a voxel [m]; the paper's leaf size."""
     max_voxels: Most = 64_000_000
     """Maximum number of voxels [1]: 25 times the default map; such a map takes 128 MB."""
@@ -373,11 +378,11 @@ class VoxelConfig:
         tuple[Positive, Positive, Positive], AfterValidator(_few_voxels), Field(validate_default=True)
     ] = (1.6, 1.6, 1.0)
     """Size of the map around the view sphere's centre [m]: a table with its margin."""
-    below: NotNegative = 0.1
+    below: Distance = 0.1
     """Depth of the map below the view sphere's centre [m]."""
     stride: Count = 2
     """Pixels between traced rays [px]; 2 is 6 mm at 1.5 m, below the voxel size."""
-    margin: NotNegative = 0.01
+    margin: Distance = 0.01
     """Distance in front of a reading that its ray does not clear [m]; depth noise then carves no surface."""
     hit: Likelihood = 0.7
     """Occupancy probability after one view with a reading in a voxel [1]; the usual sensor model."""
@@ -391,7 +396,7 @@ class ActiveVisionConfig:
 
     sphere_points: Count = 40_000
     """Number of points of the view sphere [1]; the paper's."""
-    sphere_radius: Positive = 1.5
+    sphere_radius: Length = 1.5
     """Radius of the view sphere [m]; the paper's."""
     saliency_weight: Share = 0.75
     """λ_s of eq. 2 [1]; the paper's."""
@@ -426,7 +431,7 @@ class ActiveVisionConfig:
 class RobotConfig:
     """The simulated humanoid: holonomic platform, torso lift, head with yaw and pitch."""
 
-    footprint: Positive = 0.35
+    footprint: Length = 0.35
     """Radius of the platform's disc [m]."""
     camera_height: Lengths = (1.30, 1.90)
     """Range of the camera's height above the floor [m], by the torso lift."""
@@ -434,11 +439,11 @@ class RobotConfig:
     """Range of head pitch, down to up [deg]."""
     yaw: Annotated[tuple[Azimuth, Azimuth], AfterValidator(_rising)] = (-80.0, 80.0)
     """Range of head yaw relative to the platform [deg]."""
-    camera_forward: NotNegative = 0.1
+    camera_forward: Distance = 0.1
     """Distance of the camera in front of the platform's centre [m]."""
-    cell: Positive = 0.05
+    cell: Length = 0.05
     """Edge of a cell of the floor grid [m]."""
-    floor: Positive = 3.0
+    floor: Length = 3.0
     """Half the side of the square floor area around the table that the robot may use [m]."""
     head_yaws: Count = 9
     """Number of head yaws tried to keep the platform clear of obstacles, straight ahead first [1]."""
@@ -464,9 +469,9 @@ class ArmConfig:
     is slow."""
     rolls: Count = 8
     """Number of camera rolls about the optical axis to try, level first [1]; 45° apart, 1 = level only."""
-    clearance: NotNegative = 0.15
+    clearance: Distance = 0.15
     """Minimum height of the camera above the sphere's centre [m]; lower, the hand hits the table."""
-    cell: Positive = 0.08
+    cell: Length = 0.08
     """Edge of a cell of a sampled map [m]; the number of samples needed grows with its inverse cube."""
     view_directions: Count = 150
     """Number of viewing directions in a sampled map [1]; about 16° apart."""
@@ -482,7 +487,7 @@ class SensorConfig:
     """Image height [px]."""
     focal: Positive = 525.0
     """Focal length [px]; the driver's nominal value."""
-    far: Positive = 10.0
+    far: Length = 10.0
     """Maximum depth that is rendered [m]; noise limits readings to the sensor's range."""
     light: tuple[float, float, float] = (-0.4, 0.3, 0.87)
     """Direction to the light in the world frame; not vertical, so that faces of a box differ."""
@@ -502,9 +507,9 @@ class NoiseConfig:
     """Maximum angle of incidence that gives a reading [deg]."""
     range: Lengths = (0.35, 3.0)
     """Range of readings [m]."""
-    edge_jump: NotNegative = 0.03
+    edge_jump: Distance = 0.03
     """Pixels beside a larger depth step give no reading [m]."""
-    translation: NotNegative = 0.005
+    translation: Distance = 0.005
     """σ of the registration error's translation, each view [m]."""
     rotation: Angle = 0.3
     """σ of the registration error's rotation, each view [deg]."""
@@ -516,7 +521,7 @@ class PhysicsConfig:
 
     rest_window: Positive = 0.25
     """Time over which motion is measured to decide whether an object is at rest [s]."""
-    rest_distance: Positive = 0.001
+    rest_distance: Length = 0.001
     """Maximum motion within that time of an object at rest [m]; soft contacts creep at up to 3 mm/s."""
     rest_angle: Angle = 1.0
     """Maximum rotation within that time of an object at rest [deg]."""
@@ -526,7 +531,7 @@ class PhysicsConfig:
     """Minimum upward part of a contact force that supports an object, as a share of its weight [1]."""
     removal_time: Positive = 1.0
     """Time for which the others are observed after an object is removed [s]."""
-    moved: NotNegative = 0.01
+    moved: Distance = 0.01
     """Displacement above which an object has moved [m]."""
     turned: Angle = 8.0
     """Rotation above which an object has moved [deg]."""
@@ -542,7 +547,7 @@ class EvaluationConfig:
 
     min_iou: Share = 0.5
     """Minimum IoU of volumes or masks for an object to match the ground truth [1]."""
-    table_tolerance: NotNegative = 0.02
+    table_tolerance: Distance = 0.02
     """Maximum error in height for the table to match the ground truth [m]."""
     samples: Count = 10_000
     """Number of points that measure the overlap of two volumes [1]; σ is at most 0.01, usually 0.005."""
@@ -574,7 +579,7 @@ class RecordingConfig:
     """Maximum number of pixels of any image [1]; bounds memory, several times a depth camera's."""
     max_views: Count = 30
     """Maximum number of views [1]; those farthest apart are kept. A table needs 5 to 10."""
-    min_distance: Positive = 0.10
+    min_distance: Length = 0.10
     """Distance at which a view is new, whatever its direction [m]; objects then show other sides."""
     min_angle: Annotated[float, Field(gt=0, le=180)] = 10.0
     """Rotation at which a view is new, whatever its position [deg]; objects then show other sides."""
@@ -633,7 +638,7 @@ class LiftConfig:
     """Speed of the lift [m/s]; that of a careful arm."""
     watch: NotNegative = 2.0
     """Time for which the others are observed after the lift [s]; long enough for slow tipping."""
-    moved: NotNegative = 0.02
+    moved: Distance = 0.02
     """Displacement above which an object was disturbed [m]: it slid or fell, rather than settled."""
     turned: Angle = 15.0
     """Rotation above which an object was disturbed [deg]."""
@@ -658,21 +663,21 @@ class GripperConfig:
 
     kind: GripperKind = "none"
     """Parallel jaw or suction disc; with none, every object can be grasped."""
-    opening: Positive = 0.14
+    opening: Length = 0.14
     """Maximum opening of a parallel jaw [m]."""
-    finger: Positive = 0.014
+    finger: Length = 0.014
     """Thickness of a finger along the closing direction, and half of its breadth [m]."""
-    length: Positive = 0.06
+    length: Length = 0.06
     """Length of the fingers, or of the tube behind the disc [m]."""
-    hand: Positive = 0.08
+    hand: Length = 0.08
     """Breadth and length of the hand behind them [m]."""
-    disc: Positive = 0.015
+    disc: Length = 0.015
     """Radius of a suction disc [m]."""
     tilt: Acute = 60.0
     """Maximum angle between approach and straight down [deg]; flatter, the wrist hits the table."""
-    clearance: Positive = 0.005
+    clearance: Length = 0.005
     """Minimum distance from other objects, and of an open finger from its object [m]: the error of a fit."""
-    travel: Positive = 0.1
+    travel: Length = 0.1
     """Length of the straight approach, and of the lift along which the gripper touches nothing [m]."""
     seen: Share = 0.95
     """Minimum share of the space along the approach that was seen to be free [1]; the rest is noise."""

@@ -179,7 +179,7 @@ class _Record3D:
     h: Annotated[int, Ge(1)]
     dw: Annotated[int, Ge(1)]
     dh: Annotated[int, Ge(1)]
-    fps: Annotated[float, Gt(0)] = 60.0
+    fps: Annotated[float, Ge(0.001)] = 60.0
 
 
 def _read_record3d(path: Path, max_pixels: int) -> Iterator[_Shot]:

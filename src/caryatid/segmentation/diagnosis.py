@@ -46,6 +46,12 @@ NEAR = 0.015
 """Distance of the same point in two views, relative to the reading [1]; poses are off by about 1 cm."""
 MOUNTED = 2.0
 """Error of a camera's orientation on its arm that calibration leaves [deg]; 3.5 cm at 1 m."""
+STEEP = 45.0
+"""Tilt of a plane beyond which it is a wall, and no table [deg]."""
+LEFT = 0.5
+"""Maximum share of the planes' tilt that what explains it leaves [1]."""
+FOCAL_FACTORS = np.geomspace(0.5, 2.0, 57)
+"""Factors of the focal lengths that are tried [1], 2.5 % apart: half and double mean another image size."""
 LEAST = 20
 """Minimum number of points above the table that tell whether two views show the same [1]."""
 
@@ -529,31 +535,30 @@ def _explain_tilts(views: Sequence[View]) -> str:
     Such a tilt goes with the camera, that of a world frame with the world.
     """
     planes = [(view.K, view.pose, find_image_plane(view)) for view in views]
-    # A plane that is tilted by more is a wall, and no table.
-    tables = [(K, T, p) for K, T, p in planes if p.share >= LARGE and _tilt(T, p.normal_camera(K)) < 45.0]
+    tables = [(K, T, p) for K, T, p in planes if p.share >= LARGE and _tilt(T, p.normal_camera(K)) < STEEP]
     if len(tables) < 2:
         return ""
     ups, normals = np.array([(T[2, :3], plane.normal_camera(K)) for K, T, plane in tables]).swapaxes(0, 1)
     normals_world = np.array([transforms.rotate(T, plane.normal_camera(K)) for K, T, plane in tables])
     spread = _median_angle(normals_world, np.median(normals_world, axis=0))
     # A small turn q of the camera moves each normal n by the part of q across n.
+    # Tables seen alike do not tell the turn about their normal: the least of the turns that fit is taken.
     across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
     q = np.linalg.lstsq(across.reshape(-1, 3), np.cross(normals, ups).ravel(), rcond=0.1)[0]
     turn = Rotation.from_rotvec(q)
-    if spread < MOUNTED or _median_angle(turn.apply(normals), ups) > 0.5 * spread:
+    if spread < MOUNTED or _median_angle(turn.apply(normals), ups) > LEFT * spread:
         return ""
     said = (
         f"the largest planes are tilted by {_median_angle(normals, ups):.1f}°, always the same way for "
         "the camera: check how it is mounted (hand-eye calibration)"
     )
-    factors = np.geomspace(0.5, 2.0, 57)  # 2.5 % apart
     scaled = [
         [plane.normal_camera(K * [[f, 1, 1], [1, f, 1], [1, 1, 1]]) for K, _, plane in tables]
-        for f in factors
+        for f in FOCAL_FACTORS
     ]
     tilts = [_median_angle(np.array(n), ups) for n in scaled]
-    if min(tilts) < 0.5 * spread:
-        said += f", or multiply the focal lengths by {factors[int(np.argmin(tilts))]:.2g}"
+    if min(tilts) < LEFT * spread:
+        said += f", or multiply the focal lengths by {FOCAL_FACTORS[int(np.argmin(tilts))]:.2g}"
     return said
 
 
