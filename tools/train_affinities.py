@@ -1,7 +1,7 @@
 """Train the network of automatic segmentation on simulated tables.
 
 python tools/train_affinities.py scenes FOLDER [--count N] [--seed S]    render N scenes, 8 views each
-python tools/train_affinities.py train FOLDER [--minutes M] [--out FILE]                 needs torch, onnx
+python tools/train_affinities.py train FOLDER [--minutes M] [--out FILE] [--start FILE]   needs torch, onnx
 
 Scenes hold random objects of one to a dozen convex parts: tools, bottles, mugs, bowls, toys, boxes. They fall
 onto a table, onto or into a larger object, or stand in rows. They are plain, printed or painted part by part.
@@ -203,7 +203,7 @@ def plate(rng: Rng) -> list[Part]:
 
 
 OBJECTS: dict[Maker, float] = {
-    box: 4.0, can: 3.0, ball: 1.5, bottle: 2.5, jar: 1.5, bowl: 1.2, mug: 1.8, banana: 0.8, drill: 1.8,
+    box: 4.0, can: 3.0, ball: 1.5, bottle: 2.5, jar: 1.5, bowl: 1.2, mug: 1.8, banana: 0.8, drill: 3.0,
     tool: 1.5, toy: 2.0, stone: 1.5, profile: 1.0, tray: 0.5, plate: 0.6, book: 1.2, carton: 2.0,
 }  # fmt: skip
 PRIMITIVES: dict[Maker, float] = {box: 6.0, can: 2.5, ball: 1.0, book: 1.0, carton: 1.5}
@@ -256,20 +256,60 @@ def bodies(rng: Rng) -> Iterator[tuple[list[Part], float, Array, Rotation]]:
         yield parts, scale, np.array([*(np.round(xy / 0.08) * 0.08 if level else xy), 0.12 + 0.13 * k]), R
 
 
+def surroundings(rng: Rng) -> Iterator[Part]:
+    """Yield what is no object: floor, table or none, walls, legs, shelf, bin, furniture, cables, an arm."""
+    table, kind = rng.uniform(0.45, 0.9, 2), rng.random()
+    floor = 0.0 if kind < 0.15 else rng.uniform(-0.4, -0.05) if kind < 0.3 else rng.uniform(-0.9, -0.4)
+    yield solid(GEOM.mjGEOM_PLANE, (5.0, 5.0, 0.1), (0.0, 0.0, floor))
+    if floor < 0.0:
+        yield block((*table, 0.02), (0.0, 0.0, -0.02))
+        if rng.random() < 0.4:
+            thick, inset = rng.uniform(0.015, 0.04), rng.uniform(0.03, 0.1)
+            for x, y in (table - inset) * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]):
+                yield block((thick, thick, -floor / 2.0 - 0.02), (x, y, floor / 2.0 - 0.02))
+
+    def beyond(away: float, z: float, size: Any) -> Part:
+        """Place a box beyond the middle in any direction, its first axis away from it."""
+        R = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)).as_matrix()
+        return block(size, R @ (away, 0.0, z), R)
+
+    if rng.random() < 0.4:
+        yield beyond(table.max() + rng.uniform(0.05, 1.0), 0.0, (0.05, 3.0, 2.0))
+    for _ in range(int(rng.integers(0, 4))):  # monitors, cupboards, chairs
+        size = rng.uniform((0.02, 0.26, 0.1), (0.3, 0.5, 0.35))
+        near = rng.random() < 0.5
+        away = size[0] + (rng.uniform(0.3, 0.6) if near else table.max() + rng.uniform(0.05, 0.8))
+        yield beyond(away, size[2] if near else floor + size[2], size)
+    if rng.random() < 0.15:  # a bin
+        half, height, thick = rng.uniform(0.18, 0.35, 2), rng.uniform(0.05, 0.25), rng.uniform(0.002, 0.01)
+        for axis, sign in ((0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0)):
+            size, at = np.array([*half, height / 2.0]), np.array([0.0, 0.0, height / 2.0])
+            size[axis], at[axis] = thick, sign * half[axis]
+            yield block(size, at)
+    elif rng.random() < 0.15:  # a shelf
+        depth, width, height = rng.uniform((0.12, 0.3, 0.25), (0.25, 0.5, 0.55))
+        R = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)).as_matrix()
+        yield block((depth, width, 0.012), R @ (0.1, 0.0, height), R)
+        for side in (-width, width):
+            yield block((depth, 0.012, 0.3), R @ (0.1, side, 0.3), R)
+    for _ in range(int(rng.integers(1, 3)) if rng.random() < 0.2 else 0):  # cables
+        along = np.cumsum(0.04 * rng.normal(size=(14, 2)) + 0.05 * rng.normal(size=2), axis=0)
+        radius = rng.uniform(0.002, 0.005)
+        points = np.column_stack([rng.uniform(-0.4, 0.4, 2) + along, np.full(14, radius)])
+        yield from chain(points, np.full(13, radius))
+    if rng.random() < 0.12:  # an arm and a hand
+        towards = direction(rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(5.0, 60.0)))
+        hand = np.array([*0.1 * rng.normal(size=2), rng.uniform(0.05, 0.25)])
+        reach, radii = np.array([0.0, 0.1, 0.5]), rng.uniform((0.025, 0.03), (0.045, 0.06))
+        yield from chain(hand + reach[:, None] * towards, radii)
+
+
 def settled(rng: Rng) -> tuple[Any, Any, NDArray[np.int32]]:
     """Drop objects onto a table; return the model, its state, and the label of each geom."""
     spec = mujoco.MjSpec()
     spec.option.timestep = 0.004
-    spec.worldbody.add_geom(
-        type=GEOM.mjGEOM_PLANE, size=[5.0, 5.0, 0.1], pos=[0.0, 0.0, -rng.uniform(0.4, 0.9)]
-    )
-    table = rng.uniform(0.45, 0.9, 2)
-    spec.worldbody.add_geom(type=BOX, size=[*table, 0.02], pos=[0.0, 0.0, -0.02])
-    if rng.random() < 0.4:
-        angle, away = float(rng.uniform(-np.pi, np.pi)), table.max() + rng.uniform(0.05, 1.0)
-        there = [away * np.cos(angle), away * np.sin(angle), 0.0]
-        quat = [np.cos(angle / 2.0), 0.0, 0.0, np.sin(angle / 2.0)]
-        spec.worldbody.add_geom(type=BOX, size=[0.05, 3.0, 2.0], pos=there, quat=quat)
+    for part in surroundings(rng):
+        spec.worldbody.add_geom(**part)
     matter = {"density": 400.0, "friction": [0.9, 0.02, 0.002], "condim": 4}
     for number, (parts, scale, at, R) in enumerate(bodies(rng)):
         body = spec.worldbody.add_body(name=f"object{number}", pos=at, quat=R.as_quat()[[3, 0, 1, 2]])
@@ -307,6 +347,7 @@ def painted(rng: Rng, geoms: Sequence[int], model: Any) -> Callable[[Array, Arra
     """Draw an object's look: a function from points (N, 3) in its frame, on geoms (N,), to colours (N, 3)."""
     kind, reach = rng.random(), rng.uniform(0.02, 0.12)
     colours = palette(rng, 5)
+    colours[1] *= 0.15 if rng.random() < 0.4 else 1.0  # black rubber
     part = np.zeros(model.ngeom, dtype=np.intp)
     if kind > 0.6:  # part by part
         part[list(geoms)] = np.minimum(rng.integers(0, 4, len(geoms)), int(rng.integers(1, 4)))
@@ -361,6 +402,20 @@ def ground(rng: Rng) -> Callable[[Array, Array], Array]:
     return colour
 
 
+def backdrop(rng: Rng) -> Callable[[Array, Array], Array]:
+    """Draw the look of what is no object: its geoms share a few grounds."""
+    grounds = [ground(rng) for _ in range(4)]
+
+    def colour(points: Array, on: Array) -> Array:
+        shown = np.zeros_like(points)
+        for k, look in enumerate(grounds):
+            own = on % len(grounds) == k
+            shown[own] = look(points[own], on[own])
+        return shown
+
+    return colour
+
+
 def coloured(model: Any, data: Any, points: Array, normals: Array, on: Any, paint: Any, rng: Rng) -> Any:
     """Compute colours (N, 3) uint8 of points on geoms (N,), lit by one lamp that casts shadows."""
     albedo = np.full((len(points), 3), 0.5)
@@ -393,7 +448,7 @@ def rendered(
     target[:2] += on_table[:, :2].mean(axis=0) if len(on_table) else 0.0
     rise = np.radians(rng.uniform(18.0, 65.0) if rng.random() < 0.8 else rng.uniform(65.0, 89.0))
     azimuth, roll = rng.uniform(-np.pi, np.pi), 0.08 * rng.normal()
-    eye = target + rng.uniform(0.45, 1.5) * direction(azimuth, rise)
+    eye = target + rng.uniform(0.3, 1.5) * direction(azimuth, rise)
     R = transforms.look_at(eye, target)[:3, :3] @ transforms.rotation_from_vector((0.0, 0.0, roll))
     K = intrinsics(SensorConfig(width=WIDTH, height=HEIGHT, focal=focal))
     rays, lengths = pixel_rays(K, R, WIDTH, HEIGHT)
@@ -420,7 +475,7 @@ def make_scenes(folder: tyro.conf.Positional[Path], count: int = 1800, seed: int
         rng = np.random.default_rng([seed, number])
         model, data, labels = settled(rng)
         looks: list[Any] = []
-        paint: dict[int, Any] = {0: ground(rng)}
+        paint: dict[int, Any] = {0: backdrop(rng)}
         same = rng.random() < 0.15
         for body in range(1, model.nbody):
             geoms = np.flatnonzero(model.geom_bodyid == body).tolist()
@@ -501,13 +556,14 @@ def noisy(inverse: Any, cosine: Any, rng: Rng) -> Any:
         )
         other = inverse[rows, columns]
         inverse = np.where(np.abs(other - inverse) > 0.01, other, inverse)
-    if rng.random() < 0.3:  # pixels mix both sides of an edge
-        inverse = np.where(true > 0.0, ndimage.uniform_filter(inverse, 3), inverse)
+    if rng.random() < 0.4:  # pixels mix both sides of an edge: all of them, or some that fly
+        mixed = (true > 0.0) & (rng.random(true.shape) < rng.uniform(0.2, 2.0))
+        inverse = np.where(mixed, ndimage.uniform_filter(inverse, int(rng.choice([3, 3, 5, 7]))), inverse)
     depth = np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0.0)
     sigma = rng.uniform(0.1, 1.3) * (0.0008 + 0.0019 * np.maximum(depth - 0.3, 0.0) ** 2)
     depth = depth + sigma * rng.normal(size=depth.shape)
     if rng.random() < 0.7:  # errors that neighbouring pixels share
-        depth = depth + rng.uniform(0.0, 0.003) * depth**2 * waves(rng, 6, 60)
+        depth = depth + rng.uniform(0.0, 0.004) * depth**2 * waves(rng, 6, 60)
     inverse = np.where(inverse > 0.0, 1.0 / np.maximum(depth, 0.01), 0.0)
     if rng.random() < 0.5:
         step = rng.uniform(0.0005, 0.004)
@@ -517,6 +573,10 @@ def noisy(inverse: Any, cosine: Any, rng: Rng) -> Any:
         edge = depth_edges(true, rng.uniform(0.01, 0.05))
         edge = ndimage.binary_dilation(edge) if rng.random() < 0.4 else edge
         gone |= edge & (rng.random(edge.shape) < (rng.uniform(0.3, 1.0) if rng.random() < 0.5 else 1.0))
+    if rng.random() < 0.4:  # what a projector or the second camera, to one side, does not see
+        way, shift = int(rng.choice([-1, 1])), rng.uniform(5.0, 60.0)
+        shifted = np.arange(true.shape[1]) + shift * true[:, ::way]
+        gone |= (shifted < np.maximum.accumulate(shifted, axis=1) - 0.5)[:, ::way]
     if rng.random() < 0.5:  # black or shiny spots
         gone |= waves(rng, 8, 50) > rng.uniform(1.6, 3.0)
     return np.divide(1.0, inverse, out=np.zeros_like(inverse), where=~gone & (inverse > 0.0)).astype(
@@ -551,16 +611,24 @@ def feed(queue: Any, folder: Path, seed: int) -> None:
         queue.put((seen, labels, np.stack([c[0] > 0.0 for c in crops])))
 
 
-def train(folder: tyro.conf.Positional[Path], minutes: float = 120.0, out: Path = Path(MODEL)) -> None:
-    """Train a network on rendered scenes."""
+def train(
+    folder: tyro.conf.Positional[Path],
+    minutes: float = 120.0,
+    out: Path = Path(MODEL),
+    start: Path | None = None,
+    rate: float = 2e-3,
+) -> None:
+    """Train a network on rendered scenes, anew or from the weights of another one."""
     import torch
     import torch.multiprocessing as processes
     from torch import nn
     from torch.nn import functional
 
     def layer(before: int, after: int, stride: int = 1) -> nn.Module:
+        # In a trained network, normalization has become part of the weights.
+        normal = nn.BatchNorm2d(after) if start is None else nn.Identity()
         return nn.Sequential(
-            nn.Conv2d(before, after, 3, stride, 1, bias=False), nn.BatchNorm2d(after), nn.ReLU()
+            nn.Conv2d(before, after, 3, stride, 1, bias=start is not None), normal, nn.ReLU()
         )
 
     class Network(nn.Module):  # type: ignore[misc]
@@ -602,9 +670,20 @@ def train(folder: tyro.conf.Positional[Path], minutes: float = 120.0, out: Path 
         return torch.stack(said, 1), torch.stack(counts, 1)
 
     torch.manual_seed(0)
-    network = Network().to(memory_format=torch.channels_last)
-    most = 2e-3
-    steps = torch.optim.AdamW(network.parameters(), lr=most, weight_decay=1e-4)
+    network = Network()
+    if start is not None:
+        stored = iter(read_weights(start))
+
+        def fill(layer: Any, _: Any) -> None:
+            layer.weight.data, layer.bias.data = map(torch.tensor, next(stored))
+
+        # They are stored in the order in which they run.
+        hooks = [m.register_forward_pre_hook(fill) for m in network.modules() if isinstance(m, nn.Conv2d)]
+        network(torch.zeros(1, CHANNELS, CROP, CROP))
+        for hook in hooks:
+            hook.remove()
+    network = network.to(memory_format=torch.channels_last)
+    steps = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-4)
     queue = processes.Queue(6)
     processes.Process(target=feed, args=(queue, folder, 1), daemon=True).start()
     begun, number, usual = time.monotonic(), 0, 0.7
@@ -612,7 +691,7 @@ def train(folder: tyro.conf.Positional[Path], minutes: float = 120.0, out: Path 
         seen, labels, valid = map(torch.from_numpy, queue.get())
         said, counts = targets(labels, valid)
         for group in steps.param_groups:
-            group["lr"] = most * min(1.0, (number + 1) / 50) * (0.5 + 0.5 * np.cos(np.pi * part)) + 1e-5
+            group["lr"] = rate * min(1.0, (number + 1) / 50) * (0.5 + 0.5 * np.cos(np.pi * part)) + 1e-5
         with torch.autocast("cpu", torch.bfloat16):
             odds = network(seen.contiguous(memory_format=torch.channels_last))
         losses = functional.binary_cross_entropy_with_logits(odds.float(), said, reduction="none")
@@ -629,6 +708,17 @@ def train(folder: tyro.conf.Positional[Path], minutes: float = 120.0, out: Path 
         network.eval(), (torch.zeros(1, CHANNELS, 256, 320),), out, dynamo=False, opset_version=17, **names
     )
     store_in_half(out)
+
+
+def read_weights(model: Path) -> list[tuple[Any, Any]]:
+    """Read weights and biases of the convolutions of a network, in the order in which they run."""
+    import onnx
+    from onnx import numpy_helper
+
+    graph = onnx.load(model).graph
+    known = {w.name: numpy_helper.to_array(w).astype(np.float32) for w in graph.initializer}
+    known |= {n.output[0]: known[n.input[0]] for n in graph.node if n.op_type == "Cast"}
+    return [(known[n.input[1]], known[n.input[2]]) for n in graph.node if n.op_type == "Conv"]
 
 
 def store_in_half(model: Path) -> None:
