@@ -161,6 +161,13 @@ def test_the_sphere_is_painted_and_cameras_show_what_they_saw(step, drawn):
     assert planned != tuple(drawn(by_hand)["/cameras/next"].color) == BY_HAND
 
 
+def test_the_panel_says_why_an_object_has_its_shape(page, step, settings):
+    text = describe_object(step.graph, "o1", settings.support, reasons=page.why("o1"))
+    cost = r"Why a box</dt><dd>it costs \d+ nats: points \d+, free space 0, parameters \d+<"
+    assert re.search(cost, text)
+    assert re.search(r"a cylinder instead</dt><dd>\+\d+ nats", text)
+
+
 def test_the_panel_describes_an_object(step, settings):
     graph, config = step.graph, settings.support
     text = describe_object(graph, "o1", config)
@@ -549,6 +556,7 @@ def test_a_person_goes_on_and_back_chooses_a_view_by_hand_and_clears(seen):
     assert np.linalg.norm(taken[:3, 3] - eye) < 0.2
 
     page.describe("o2")
+    tab.wait_for_text("Why a box")
     tab.press("clear")
     tab.wait_for_text("Finished: no objects are left; no other object moved.")
     tab.wait_for_node("/shapes/o1", there=False)

@@ -80,6 +80,7 @@ class LoopPage(Page):
         self.planner, self._masks = planner, masks
         self._begin()
         super().__init__(f"caryatid: {self.source.name}", config.support, host=host, port=port)
+        self.why = lambda object_id: self._explorer.scene.why(object_id)
         self._worker = ThreadPoolExecutor(1, "loop")
         self._running = Event()
         self._add_controls()

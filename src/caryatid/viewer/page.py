@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from html import escape
 from threading import RLock
@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from caryatid.config import SupportConfig
+from caryatid.errors import InputError
 from caryatid.exploration import Step
 from caryatid.graph import SupportGraph
+from caryatid.objects.reasons import Reasons
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import direction
 from caryatid.support.relations import removal_of
@@ -48,6 +50,7 @@ class Page:
         drawing: The scene in the page.
         steps: The steps added so far.
         scores: F1 after each step, or None without ground truth.
+        why: Says why an object of the newest step has its shape; None if only files of it are left.
         working: Lock for computing: two threads would change each other's number of BLAS threads.
 
     Raises:
@@ -68,6 +71,7 @@ class Page:
         self.server, self.url = self._door.server, self._door.url
         self.steps: list[Step] = []
         self.scores: list[float | None] = []
+        self.why: Callable[[str], Reasons] | None = None
         self.drawing = SceneDrawing(self.server, self.describe)
         self._support, self._small = support or SupportConfig(), small
         self._shown, self._chosen = -1, ""
@@ -97,6 +101,7 @@ class Page:
     def update(self, scene: Scene) -> None:
         """Add the current state of a scene; the slider goes back to earlier states."""
         if scene.views:
+            self.why = scene.why
             self.add(step_of_scene(scene))
 
     def show_layer(self, name: str, visible: bool) -> None:
@@ -225,7 +230,10 @@ class Page:
             with self.working:
                 gone = {each.lift.object_id for each in steps if each.lift is not None}
                 taken = chosen in gone | {o.id for o in steps[-1].graph.objects}
-                texts.append((self._about, describe_object(graph, chosen, self._support, taken=taken)))
+                newest = step is self.steps[-1]
+                why = self._reasons_of(chosen) if newest else None
+                text = describe_object(graph, chosen, self._support, taken=taken, reasons=why)
+                texts.append((self._about, text))
         look = {"point_size": self._size.value / 1000.0, "true_colours": self._true_colours.value}
         # Scene and texts change together.
         with self.server.atomic():
@@ -235,6 +243,12 @@ class Page:
             self._slider.value = self._shown + 1
             for panel, text in texts:
                 panel.content = text
+
+    def _reasons_of(self, object_id: str) -> Reasons | None:
+        """Why an object of the newest step has its shape; None for the table, or what no view shows."""
+        with contextlib.suppress(InputError):
+            return None if self.why is None else self.why(object_id)
+        return None
 
 
 def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
@@ -294,9 +308,14 @@ def _describe_signs() -> str:
 
 
 def describe_object(
-    graph: SupportGraph, object_id: str, config: SupportConfig, *, taken: bool = False
+    graph: SupportGraph,
+    object_id: str,
+    config: SupportConfig,
+    *,
+    taken: bool = False,
+    reasons: Reasons | None = None,
 ) -> str:
-    """Describe an object: its edges, what moves without it, size and fit; or that it was removed."""
+    """Describe an object: its edges, what moves without it, size, fit and reasons; or that it was removed."""
     item = next((o for o in graph.objects if o.id == object_id), None)
     if item is None:
         return cell_html(Section(object_id, "was removed" if taken else "not found up to this view"))
@@ -313,6 +332,12 @@ def describe_object(
     table = object_table(graph)
     (row,) = (row for row in table.rows if row[0].text == item.title)
     facts += [(name, e.text) for name, e in zip(table.columns, row, strict=True) if e.text][2:]
+    if reasons is not None:
+        chosen, *others = reasons.options
+        terms = {"points": chosen.points, "free space": chosen.free, "parameters": chosen.parameters}
+        cost = ", ".join(f"{name} {nats:.0f}" for name, nats in terms.items())
+        facts.append((f"Why {chosen.what}", f"it costs {chosen.total:.0f} nats: {cost}"))
+        facts += [(f"{o.what} instead", f"{o.total - chosen.total:+.0f} nats") for o in others]
     return cell_html(Section(item.title, item.shape.kind, facts=facts, colour=object_colour(item.label)))
 
 
