@@ -20,7 +20,7 @@ from caryatid.geometry import transforms
 from caryatid.io.bop import read_recording, write_recording
 from caryatid.io.datasets import SAMPLES
 from caryatid.sensing.views import SUPPORT_LABEL
-from caryatid.steps import read_run
+from caryatid.steps import read_run, read_steps
 
 ESCAPE = "\x1b"
 BOTH = pytest.mark.parametrize("command", ["extract", "explore"])
@@ -73,6 +73,9 @@ def test_every_view_has_its_graph_labels_pose_and_choice(kept_run):
     assert np.allclose(choice["T_world_camera"], run.views[1].record["T_world_camera"], atol=1e-6)
     assert run.views[0].record["candidates"]["reachable"] > 100
     assert "next" not in run.views[1].record
+    steps = list(read_steps(run))
+    assert [reasons.subject for reasons in steps[-1].reasons] == [("o1",), ("o2",)]
+    assert not steps[0].reasons
 
 
 # Sources

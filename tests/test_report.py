@@ -27,6 +27,7 @@ from caryatid.exploration import RobotPose, Step
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere, fibonacci_sphere
 from caryatid.graph import Change, SceneObject, Stability, Support, SupportGraph
+from caryatid.objects.reasons import Option, Reasons
 from caryatid.planning.candidates import Candidates, Posture
 from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
@@ -110,9 +111,14 @@ def step_after(view: View, index: int = 0, *, decide: bool = True) -> Step:
         angle_travelled=0.9 * index,
         path_travelled=1.4 * index,
         stop=None if decide else "the graph did not change",
+        reasons=() if decide else REASONS,
     )
 
 
+REASONS = (
+    Reasons(("o1",), (Option("a box", 99.6, 0.0, 40.5), Option("a <can>", 150.0, 3.0, 31.5))),
+    Reasons(("o7",), (Option("a sphere", 12.0, 0.0, 18.0),)),
+)
 TAKEN = Change("removed", "o9", 1, "empty <space> where it stood")
 STOOD = RobotPose(Posture(np.array([-1.2, 0.0, 0.0]), 1.6, 0.0, -0.5), at(-1.2, 0.0, 1.6), 0.35, False)
 

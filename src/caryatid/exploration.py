@@ -16,6 +16,7 @@ from caryatid.errors import InputError, PlanningError, check_type
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Change, SupportGraph, TakeStep
+from caryatid.objects.reasons import Reasons
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, Planner, PlanningState, check_candidates, path_cost
 from caryatid.planning.expected_visibility import predict_goal, settled
@@ -83,6 +84,7 @@ class Step(Pictured):
         changes: Changes of objects since the previous view, seen or reported.
         lift: The object removed after this view, or None.
         removal: With a goal that was found: what moves when it is removed; otherwise None.
+        reasons: Why each object has its shape; empty before the last step.
     """
 
     index: int
@@ -103,6 +105,7 @@ class Step(Pictured):
     changes: tuple[Change, ...] = ()
     lift: TakeStep | None = None
     removal: Removal | None = None
+    reasons: tuple[Reasons, ...] = ()
 
     def __repr__(self) -> str:
         following = f"stop: {self.stop}" if self.decision is None else f"next: {self.decision.why}"
@@ -437,6 +440,7 @@ def explore(
             yield step
             step = explorer.go()
         if step.stop is not None:
+            step = replace(step, reasons=explorer.scene.reasons())
             lost = goal is not None and all(o.id != goal for o in step.graph.objects)
             yield replace(step, stop=f"{step.stop}; {goal} was not found") if lost else step
             return

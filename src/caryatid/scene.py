@@ -198,6 +198,11 @@ class Scene(Pictured):
             raise InputError(object_id, "is the same object", "ask about two different objects")
         return replace(self._models.reasons(labels, self.voxels), subject=tuple(ids))
 
+    def reasons(self) -> tuple[Reasons, ...]:
+        """Say why each object has its shape: `why` of all that have points."""
+        known = (o.id for o in self.graph.objects if o.role == "object")
+        return tuple(self.why(id_) for id_ in known if self._label_of(id_) in self._models.fits)
+
     def predict_removal(self, object_id: str) -> tuple[Effect, ...]:
         """Predict which objects move when one is removed, with probability and reason.
 

@@ -334,7 +334,8 @@ def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:
     """The steps of all views, or the error of the last if none shows a support surface."""
     for left, frame in zip(range(len(recording))[::-1], recording.frames, strict=True):
         try:
-            yield from explorer.looks(frame.load())
+            for step in explorer.looks(frame.load()):
+                yield step if left else replace(step, reasons=explorer.scene.reasons())
         except NoSurfaceError as error:
             if not left:
                 raise

@@ -27,6 +27,7 @@ from caryatid.io import images
 from caryatid.io.graph_json import graph_text, read_graph
 from caryatid.io.json_files import json_text, parse_json, read_json
 from caryatid.io.staging import StagedFolder, read_errors, recover
+from caryatid.objects.reasons import Option, Reasons
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
@@ -46,7 +47,7 @@ OWN_FILES: Final = re.compile(
 """Files of a run folder."""
 PARTS = (
     View, Cloud, ViewSphere, Candidates, Decision, PointOfInterest, Posture, RobotPose, Change, TakeStep,
-    Grasp, Removal, Effect,
+    Grasp, Removal, Effect, Reasons, Option,
 )  # fmt: skip
 """Classes that a step is made of."""
 

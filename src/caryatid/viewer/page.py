@@ -50,7 +50,7 @@ class Page:
         drawing: The scene in the page.
         steps: The steps added so far.
         scores: F1 after each step, or None without ground truth.
-        why: Says why an object of the newest step has its shape; None if only files of it are left.
+        why: Says why an object of the newest step has its shape, or None: then only its last step tells.
         working: Lock for computing: two threads would change each other's number of BLAS threads.
 
     Raises:
@@ -230,8 +230,7 @@ class Page:
             with self.working:
                 gone = {each.lift.object_id for each in steps if each.lift is not None}
                 taken = chosen in gone | {o.id for o in steps[-1].graph.objects}
-                newest = step is self.steps[-1]
-                why = self._reasons_of(chosen) if newest else None
+                why = self._reasons_of(chosen, step)
                 text = describe_object(graph, chosen, self._support, taken=taken, reasons=why)
                 texts.append((self._about, text))
         look = {"point_size": self._size.value / 1000.0, "true_colours": self._true_colours.value}
@@ -244,11 +243,12 @@ class Page:
             for panel, text in texts:
                 panel.content = text
 
-    def _reasons_of(self, object_id: str) -> Reasons | None:
-        """Why an object of the newest step has its shape; None for the table, or what no view shows."""
-        with contextlib.suppress(InputError):
-            return None if self.why is None else self.why(object_id)
-        return None
+    def _reasons_of(self, object_id: str, step: Step) -> Reasons | None:
+        """Why an object has its shape after a step; None if that is unknown."""
+        if self.why is not None and step is self.steps[-1]:
+            with contextlib.suppress(InputError):
+                return self.why(object_id)
+        return next((reasons for reasons in step.reasons if reasons.subject == (object_id,)), None)
 
 
 def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:

@@ -40,6 +40,7 @@ from caryatid.viz.tables import (
     noticed,
     object_table,
     point_table,
+    reason_table,
     sentence,
     support_table,
 )
@@ -196,6 +197,7 @@ def make_report(
         text = "Each object is lifted straight up in simulation, one after the other."
         sections.append(Section("Removal", text, strip))
     tables = [object_table(last.graph), support_table(last.graph)]
+    tables += [reason_table(last.reasons, last.graph)] * bool(last.reasons)
     sections += [Section("Objects and supports", tables=tables, folded=True), *views]
     words = {None: "not set", True: "on", False: "off"}
     given = (settings or {}).items()

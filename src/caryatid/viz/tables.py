@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from caryatid.viz.colours import object_colour, saliency_colour
 if TYPE_CHECKING:
     from caryatid.exploration import Step
     from caryatid.manipulation.order import Order
+    from caryatid.objects.reasons import Reasons
     from caryatid.planning.decision import Decision
 
 
@@ -90,6 +91,19 @@ def support_table(graph: SupportGraph) -> Table:
     )
     columns = ("supporter", "supported", "kind", "probability", "found in views", "evidence")
     return Table.of("Supports", columns, rows)
+
+
+def reason_table(reasons: Sequence[Reasons], graph: SupportGraph) -> Table:
+    """Make the table of what objects cost as what they are, and as what costs least otherwise [nats]."""
+    shown = {o.id: Entry(o.title, object_colour(o.label)) for o in graph.objects}
+    rows = []
+    for reason in reasons:
+        (object_id,), (chosen, *others) = reason.subject, reason.options
+        terms = (chosen.points, chosen.free, chosen.parameters, chosen.total)
+        otherwise = f"{others[0].what} {others[0].total - chosen.total:+.0f}" if others else "–"
+        rows.append((shown[object_id], chosen.what, *(f"{nats:.0f}" for nats in terms), otherwise))
+    columns = ("object", "explanation", "points", "free space", "parameters", "total", "next best")
+    return Table.of("Why these shapes: costs in nats", columns, rows)
 
 
 def point_table(decision: Decision | None) -> Table:
