@@ -111,11 +111,7 @@ def _parts(
     config: Config,
     rng: np.random.Generator,
 ) -> list[tuple[Groups, float]] | None:
-    """Points of each object among those with this index, and its cost [nats]; None if they are one object.
-
-    A shape must explain each part, or the colours must pay for another object: pieces of an object that has
-    no shape are not objects.
-    """
+    """Points of each object among those with this index, and its cost [nats]; None if they are one object."""
     own = evidence.select(index)
     found = best_division(own, whole, [h[index] for h in hints], config, rng)
     if found is None or found.cost >= whole.cost:
@@ -124,8 +120,6 @@ def _parts(
     border = found.border + found.others
     for side, explanation in zip((~found.second, found.second), found.explanations, strict=True):
         further = _parts(evidence, explanation, index[side], hints, config, rng)
-        if not (found.by_colour or further or explained(explanation, own.select(side), config.explanation)):
-            return None
         parts += further or [(index[side], explanation.cost)]
     compound = best_compound(own, config, border + sum(cost for _, cost in parts))
     return parts if compound.shape is None else None

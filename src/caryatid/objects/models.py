@@ -530,11 +530,17 @@ class ObjectModels:
         self._owners = {k: known for k, known in self._owners.items() if k not in labels}
 
     def _noise(self) -> float:
-        """Standard deviation of points from their surfaces [m]: the median of those that are primitives."""
-        # 1.25 mean absolute values of a normal distribution are one standard deviation; registration leaves
-        # 2 mm at the least.
+        """Standard deviation of points from their surfaces [m]: the table's, or the primitives' if larger.
+
+        Primitives alone do not tell: with more noise, fewer objects are primitives.
+        """
+        config, points = self._config, self.points.of(SUPPORT_LABEL, self._config.explanation.spacing)
+        places = points.points_world - points.points_world.mean(axis=0) if len(points) else np.zeros((1, 3))
+        table = np.abs(places @ np.linalg.eigh(places.T @ places)[1][:, 0])
+        # 1.48 median or 1.25 mean absolute values of a normal distribution are one standard deviation.
         residuals = [o.residual for k, o in self.fits.items() if k not in self._solids]
-        return max(1.25 * float(np.median(residuals)), 0.002) if residuals else 0.002
+        primitives = 1.25 * float(np.median(residuals)) if residuals else 0.0
+        return max(1.48 * float(np.median(table)), primitives, config.fit.registration)
 
     def _fit(
         self, labels: set[int], points_of: Callable[[int], Cloud], voxels: VoxelMap | None = None

@@ -55,13 +55,13 @@ DECIDING = frozenset({"benchmark/episodes.py"})
 
 @cache
 def fingerprint() -> str:
-    """Digest of the code and library versions that determine the result of an episode."""
+    """Digest of code, network and library versions that determine the result of an episode."""
     import hashlib
     from importlib.metadata import version
 
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
-    for file in sorted(root.rglob("*.py")):
+    for file in sorted([*root.rglob("*.py"), *root.rglob("*.onnx")]):
         name = file.relative_to(root).as_posix()
         if not BYSTANDERS & set(name.split("/")) or name in DECIDING:
             digest.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())

@@ -181,11 +181,11 @@ def observe(
         apart = apart[np.isin(apart, labels).all(axis=1)]
     else:
         labels = segment_cloud(cloud, surfaces[0], config.segmentation)
-    below = find_surface_below(surfaces, cloud.points_world[labels > 0])
-    held = np.bincount(below, minlength=len(surfaces))
-    if not known and held[0] == 0 and held.any():
+    if not known:
         # The camera looks at what carries something, and past it at what does not.
-        main = int(np.argmax(held))
+        below = find_surface_below(surfaces, cloud.points_world[labels > 0])
+        held = np.bincount(below, minlength=len(surfaces))
+        main = 0 if held[0] else int(np.argmax(held))
         surfaces = (surfaces[main], *surfaces[:main], *surfaces[main + 1 :])
     reach = config.surface.tolerance
     for k, surface in enumerate(surfaces):

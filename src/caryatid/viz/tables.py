@@ -96,7 +96,7 @@ def support_table(graph: SupportGraph) -> Table:
 def reason_table(reasons: Sequence[Reasons], graph: SupportGraph) -> Table:
     """Make the table of what objects cost as what they are, and as what costs least otherwise [nats]."""
     shown = {o.id: Entry(o.title, object_colour(o.label)) for o in graph.objects}
-    rows = []
+    rows: list[tuple[str | Entry, ...]] = []
     for reason in reasons:
         (object_id,), (chosen, *others) = reason.subject, reason.options
         terms = (chosen.points, chosen.free, chosen.parameters, chosen.total)
