@@ -556,7 +556,7 @@ def test_a_person_goes_on_and_back_chooses_a_view_by_hand_and_clears(seen):
     assert np.linalg.norm(taken[:3, 3] - eye) < 0.2
 
     page.describe("o2")
-    tab.wait_for_text("Why a box")
+    tab.wait_for_text("Why a cylinder")
     tab.press("clear")
     tab.wait_for_text("Finished: no objects are left; no other object moved.")
     tab.wait_for_node("/shapes/o1", there=False)
