@@ -41,7 +41,7 @@ def _few_voxels(extent: tuple[float, float, float], info: ValidationInfo) -> tup
 Positive = Annotated[float, Field(gt=0, le=1e18)]
 NotNegative = Annotated[float, Field(ge=0, le=1e18)]
 Length = Annotated[float, Field(gt=0, le=1000)]
-"""More would be no room, and its square beside that of the smallest error of depth lose digits."""
+"""A longer one is no room; in its square, that of the smallest error of depth would be rounded away."""
 Distance = Annotated[float, Field(ge=0, le=1000)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Likelihood = Annotated[float, Field(gt=0, lt=1)]
