@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import SMALL, TWO_ON_A_TABLE, refusal, run_command, without_labels, without_poses
+from raycast import TABLE, from_the_side, table_scene
 from synthetic import TABLE_TOP, model_of, simulated_scene, simulated_views
 
 from caryatid.config import SensorConfig
@@ -317,3 +318,11 @@ def test_a_fault_of_our_own_is_one_line_too_and_debug_shows_it(tmp_path, scene_f
     with pytest.raises(ZeroDivisionError):
         run_command(*command, "--debug")
     assert not (tmp_path / "run").exists()
+
+
+def test_what_is_too_long_for_an_object_is_said_and_reported(tmp_path, capsys):
+    bar = (np.array([0.0, 0.0, TABLE + 0.03]), np.array([0.06, 0.7, 0.06]))
+    write_recording(tmp_path / "long", [replace(table_scene(from_the_side(), [bar]), labels=None)])
+    assert run_command("extract", tmp_path / "long", "--out", tmp_path / "run") == 0
+    assert "something longer than 0.5 m is left out" in "".join(capsys.readouterr())
+    assert (tmp_path / "run" / "report.html").exists()

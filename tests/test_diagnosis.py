@@ -36,7 +36,7 @@ def deep(change):
 
 
 FAULTS = {
-    "as if in millimetres: give metres": deep(lambda v: 1e3 * v.depth),
+    "as if in millimetres, 1000 times as long as by the poses: divide": deep(lambda v: 1e3 * v.depth),
     "the distance along the ray": deep(lambda v: v.depth * ray_lengths(v)),
     "inverse depth": deep(lambda v: np.where(v.valid, 1.0 / np.maximum(v.depth, 0.1), 0.0)),
     "K is for a resolution of 640×480, multiply its first two rows by 0.5": lambda v: replace(
@@ -88,6 +88,27 @@ def test_focal_lengths_are_right_once_multiplied(sound, factor):
     f = float(remedy[1])
     mended = [replace(view, K=view.K * [[f, 1, 1], [1, f, 1], [1, 1, 1]]) for view in spoilt]
     assert diagnose(mended, Config()).problems == []
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_turned_images_are_right_once_turned_back(sound, quarters):
+    def turned(view, quarters, cx, cy):
+        K = view.K.copy()
+        K[:2, 2] = cx, cy
+        K[[0, 1], [0, 1]] = K[[0, 1], [0, 1]] if quarters % 2 == 0 else K[[1, 0], [1, 0]]
+        return replace(view, depth=np.rot90(view.depth, quarters).copy(), rgb=None, labels=None, K=K)
+
+    height, width = sound[0].depth.shape
+    cx, cy = sound[0].K[:2, 2]
+    x, y = ((cy, width - 1 - cx), (width - 1 - cx, height - 1 - cy), (height - 1 - cy, cx))[quarters - 1]
+    spoilt = [turned(view, quarters, x, y) for view in sound]
+    (problem,) = diagnose(spoilt, Config()).problems
+    back = int(re.search(r"np\.rot90\(image, (-?\d)\)", problem)[1])
+    assert ("swap fx and fy" in problem) == (quarters != 2)
+    height, width = spoilt[0].depth.shape
+    centre = re.search("cx, cy = (.+?)(?: with|$)", problem)[1]
+    centre = eval(centre, {"cx": x, "cy": y, "height": height, "width": width})
+    assert diagnose([turned(view, back, *centre) for view in spoilt], Config()).problems == []
 
 
 def test_the_report_says_what_is_wrong_above_the_pictures(sound, tmp_path, capsys):

@@ -479,6 +479,7 @@ class Scene(Pictured):
             below = below.closed_below(surface.outline_world, surface.normal_world, depth)
         table = observation.footprint(self.surfaces, self.config.explanation.spacing)
         observation = self._form_objects(observation, shown, below, table, given)
+        self._check_fitted(source.name)
         if not named:
             observation, new = self._reidentified(observation, new)
         watch.lap("fit")
@@ -555,6 +556,19 @@ class Scene(Pictured):
             if over.sum() * self.config.cloud.voxel**2 >= self.config.segmentation.min_area:
                 remedy = "no mask covers them" if masks else "move closer, or give a larger image or masks"
                 log.warning("%s: %d points above the table belong to no object; %s", name, over.sum(), remedy)
+
+    def _check_fitted(self, name: str) -> None:
+        """Warn, once, that something on the table is left out because it is too long for an object."""
+        limit = self.config.fit.max_extent
+        note = f"something longer than {limit:g} m is left out; if it is an object, raise fit.max_extent"
+        if note in self._notes:
+            return
+        for label in sorted(set(self._models.points.objects) - self._models.fits.keys()):
+            places = self._models.points.of(label).points_world
+            if len(places) and np.linalg.norm(np.ptp(places, axis=0)) > limit:
+                log.warning("%s: %s", name, note)
+                self._notes |= {note}
+                return
 
     def _registered(self, observation: Observation) -> tuple[Observation, set[int]]:
         """Register the view to the earlier ones, and correct their poses too.

@@ -58,6 +58,8 @@ def check_views(command: Check) -> int:
         ])  # fmt: skip
     said = "".join(f"wrong: {problem}\n" for problem in found.problems)
     said += "".join(f"not confirmed: {doubt}\n" for doubt in found.doubts)
+    if found.problems:
+        said += "Mend this, or give the options named here to every command, and check again.\n"
     said += "" if said else "nothing is wrong\n"
     shown = table(f"{source}: {count_of(len(rows), 'view')}", [*columns.values()], rows, figures=True)
     if command.report is not None:

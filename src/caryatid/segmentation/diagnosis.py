@@ -67,7 +67,10 @@ EARLY = "each pose is that of the view before: check the clocks of camera and po
 """A cause of wrong camera poses, and its remedy."""
 LATE = "each pose is that of the view after: check the clocks of camera and poses"
 """A cause of wrong camera poses, and its remedy."""
-OTHER_CAMERA = "K is for another resolution: multiply its first two rows by the ratio of the image sizes"
+OTHER_CAMERA = (
+    "K is for another resolution: multiply its first two rows (of cam_K in a recording) by the ratio of the "
+    "image sizes"
+)
 """A cause of wrong lengths, and its remedy."""
 GL_AXES = (
     "the camera axes are OpenGL's (y up, z backward) instead of OpenCV's (y down, z forward): give "
@@ -77,6 +80,13 @@ GL_AXES = (
 BODY_AXES = (
     "the pose is that of the camera's body (x forward, z up) instead of its optical frame (x right, y down, "
     "z forward): give the pose of the optical frame, or for a recording --set recording.axes=body"
+)
+"""A cause of a wrong camera pose, and its remedy."""
+
+
+INVERSE = (
+    "T_world_camera is the inverse, world to camera (cam_R_w2c and cam_t_w2c of a recording are then camera "
+    "to world): invert it"
 )
 """A cause of a wrong camera pose, and its remedy."""
 
@@ -102,10 +112,8 @@ def _scale_translation(T: Array, factor: float) -> Array:
 POSES: Mapping[str, Callable[[Array], Array]] = {
     GL_AXES: lambda T: T @ GL,
     BODY_AXES: lambda T: T @ BODY,
-    "T_world_camera is the inverse, world to camera: invert it": transforms.invert,
-    f"T_world_camera is the inverse, world to camera: invert it; and {GL_AXES}": lambda T: (
-        transforms.invert(T) @ GL
-    ),
+    INVERSE: transforms.invert,
+    f"{INVERSE}; and {GL_AXES}": lambda T: transforms.invert(T) @ GL,
     f"the world's y axis points up: {Z_UP}": lambda T: Y_UP @ T,
     f"{GL_AXES}, and the world's y axis points up: {Z_UP}": lambda T: Y_UP @ T @ GL,
     f"the world's z axis points down: {Z_UP}": lambda T: GL @ T,
@@ -116,13 +124,22 @@ POSES: Mapping[str, Callable[[Array], Array]] = {
         _roll_quaternion, by=1
     ),
     **{
-        f"the image is turned by {angle}° against its pose: turn image and K back": partial(
-            _turn_camera, angle=angle
+        f"the image is turned by {angle}° against its pose: turn depth, colour and masks back with "
+        f"np.rot90(image, {quarters}), {camera}": partial(_turn_camera, angle=angle)
+        for angle, quarters, camera in (
+            (90, -1, "swap fx and fy, and set cx, cy = height - 1 - cy, cx with the height before"),
+            (180, 2, "and set cx, cy = width - 1 - cx, height - 1 - cy"),
+            (-90, 1, "swap fx and fy, and set cx, cy = cy, width - 1 - cx with the width before"),
         )
-        for angle in (90, 180, -90)
     },
 }
 """Conventions of poses (4, 4) other than ours, with their remedy, and how to read such a pose."""
+DEPTH_UNITS: Mapping[str, float] = {
+    "millimetres": 1e3, "centimetres": 1e2, "tenths of a millimetre": 1e4, "kilometres": 1e-3,
+}  # fmt: skip
+"""How many of the units that depth is met in make a metre [1]."""
+DEPTH_SCALE = "in a recording, pixels times depth_scale are in millimetres"
+"""How recordings give the unit of depth."""
 UNITS: Mapping[str, float] = {
     f"the translation of T_world_camera is {1.0 / factor:.4g} times as long as depth says{unit}: give both in"
     " metres; in a recording, cam_t_w2c is in millimetres, and depth_scale makes them of depth": factor
@@ -234,7 +251,10 @@ def check_camera(view: View, max_coordinate: float) -> None:
     far = 0.0 if view.T_world_camera is None else float(np.linalg.norm(view.T_world_camera[:3, 3]))
     if far > AWAY:
         reason = f"the camera is {far:.4g} m from the world's origin, as if in millimetres or centimetres"
-        remedy = f"give T_world_camera in metres, in a world whose origin is within {AWAY:g} m"
+        remedy = (
+            "give T_world_camera in metres (cam_t_w2c of a recording in millimetres), in a world whose "
+            f"origin is within {AWAY:g} m"
+        )
         raise WrongViewError(view.name, reason, remedy)
     if float(view.depth.max(initial=0.0)) > max_coordinate:
         unit = describe_unit(view.depth[view.valid])
@@ -282,8 +302,8 @@ def describe_centre(view: View) -> str:
         return f"{where}; is K for another resolution?"
     scale = K[0, 0] / view.K[0, 0]
     whole = 8 * np.rint(size / scale / 8.0).astype(np.intp)  # as images are
-    other = f"if K is for a resolution of {whole[0]}×{whole[1]}"
-    return f"{where}; {other}, multiply its first two rows by {size[0] / whole[0]:.4g}"
+    remedy = f"multiply its first two rows by {size[0] / whole[0]:.6g} (those of cam_K in a recording)"
+    return f"{where}; if K is for a resolution of {whole[0]}×{whole[1]}, {remedy}"
 
 
 def scaled_camera(view: View) -> Array | None:
@@ -433,7 +453,7 @@ class Diagnosis:
             `near` and `far` between which nine in ten readings are [m], horizontal field of view [deg], the
             share of the readings on its largest plane, and that plane's tilt [deg], or None without a pose.
         problems: What is wrong, and how to mend it.
-        doubts: What could not be confirmed, and why.
+        doubts: What could not be confirmed, and why, if nothing is wrong.
     """
 
     views: list[dict[str, Any]]
@@ -461,7 +481,7 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         # Parts of images have their principal point anywhere.
         said = {"": "", "K": "" if level else centre}
         if unit := describe_unit(view.depth[view.valid]):
-            said["unit"] = f"depth is {near:.4g}–{far:.4g} m{unit}: give metres"
+            said["unit"] = f"depth is {near:.4g}–{far:.4g} m{unit}: give metres ({DEPTH_SCALE})"
         for check in (partial(check_camera, max_coordinate=config.cloud.max_coordinate), check_depth):
             try:
                 check(view)
@@ -502,7 +522,12 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         elif best == OTHER_CAMERA:
             usual["K"] = centre or OTHER_CAMERA
         elif best in UNITS and "unit" in usual:
-            usual["unit"] += f" (by the poses, {UNITS[best]:.4g} times as long as it should be)"
+            factor, length = UNITS[best], usual["unit"].partition(",")[0]
+            named = {k: f" as if in {unit}," for unit, k in DEPTH_UNITS.items()}.get(factor, "")
+            usual["unit"] = (
+                f"{length},{named} {factor:.4g} times as long as by the poses: divide it by {factor:.4g} "
+                f"({DEPTH_SCALE})"
+            )
         elif best:
             usual = {key: text for key, text in usual.items() if key not in conventions} | {best: best}
         elif _have_one_pose(thin):
@@ -510,7 +535,8 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         elif not usual and shares[""] < LARGE:
             shared = f"{shares['']:.0%} of what they show above their largest planes"
             doubts.append(f"poses, because consecutive views share only {shared}")
-    return Diagnosis(rows, list(usual.values()), doubts)
+    # What is wrong may hide the rest.
+    return Diagnosis(rows, list(usual.values()), [] if usual else doubts)
 
 
 def _have_one_pose(views: Sequence[View]) -> bool:
@@ -584,7 +610,6 @@ def _tilt(T_world_camera: Array, normal_camera: Array) -> float:
 
 def describe_unit(readings: NDArray[np.floating]) -> str:
     """Say in which other unit readings (N,) would be about a metre, as of a table; else ""."""
-    units = {"millimetres": 1e-3, "centimetres": 1e-2, "tenths of a millimetre": 1e-4, "kilometres": 1e3}
-    median, factors = float(np.median(readings)), {"": 1.0, **units}
-    unit = min(factors, key=lambda name: abs(np.log(median * factors[name])))
+    median, counts = float(np.median(readings)), {"": 1.0, **DEPTH_UNITS}
+    unit = min(counts, key=lambda name: abs(np.log(median / counts[name])))
     return f", as if in {unit}" if unit else ""

@@ -404,7 +404,7 @@ def draw_chart(
     width, height = 480.0, 240.0
     low, high = np.array([58.0, 168.0]), np.array([461.0, 34.0])  # corners of the axes
     count = max(map(len, lines.values()))
-    most = top or float(np.nanmax([value for values in lines.values() for value in values], initial=1e-9))
+    most = top or max((float(v) for values in lines.values() for v in values if v > 0.0), default=1.0)
     steps = 10.0 ** np.floor(np.log10(most)) * np.array([0.1, 0.2, 0.5, 1.0, 2.0])
     step = steps[np.argmax(most / steps <= 5.0)]
 
