@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -109,20 +109,10 @@ def _scale_translation(T: Array, factor: float) -> Array:
     return transforms.rigid(T[:3, :3], factor * T[:3, 3])
 
 
-POSES: Mapping[str, Callable[[Array], Array]] = {
+CAMERAS: Mapping[str, Callable[[Array], Array]] = {
+    "": lambda T: T,
     GL_AXES: lambda T: T @ GL,
     BODY_AXES: lambda T: T @ BODY,
-    INVERSE: transforms.invert,
-    f"{INVERSE}; and {GL_AXES}": lambda T: transforms.invert(T) @ GL,
-    f"the world's y axis points up: {Z_UP}": lambda T: Y_UP @ T,
-    f"{GL_AXES}, and the world's y axis points up: {Z_UP}": lambda T: Y_UP @ T @ GL,
-    f"the world's z axis points down: {Z_UP}": lambda T: GL @ T,
-    "the quaternion of the pose begins with w, but was read as x y z w: reorder it": partial(
-        _roll_quaternion, by=-1
-    ),
-    "the quaternion of the pose ends with w, but was read as w x y z: reorder it": partial(
-        _roll_quaternion, by=1
-    ),
     **{
         f"the image is turned by {angle}° against its pose: turn depth, colour and masks back with "
         f"np.rot90(image, {quarters}), {camera}": partial(_turn_camera, angle=angle)
@@ -133,7 +123,42 @@ POSES: Mapping[str, Callable[[Array], Array]] = {
         )
     },
 }
-"""Conventions of poses (4, 4) other than ours, with their remedy, and how to read such a pose."""
+"""Conventions of camera frames other than ours, with their remedy, and how to read such a pose (4, 4)."""
+WORLDS: Mapping[str, Callable[[Array], Array]] = {
+    "": lambda T: T,
+    f"the world's y axis points up: {Z_UP}": lambda T: Y_UP @ T,
+    f"the world's z axis points down: {Z_UP}": lambda T: GL @ T,
+}
+"""The same of world frames."""
+WAYS: Mapping[str, Callable[[Array], Array]] = {
+    "": lambda T: T,
+    INVERSE: transforms.invert,
+    "the quaternion of the pose begins with w, but was read as x y z w: reorder it": partial(
+        _roll_quaternion, by=-1
+    ),
+    "the quaternion of the pose ends with w, but was read as w x y z: reorder it": partial(
+        _roll_quaternion, by=1
+    ),
+}
+"""The same of how poses are written."""
+
+
+def _apply(T: Array, steps: Sequence[Callable[[Array], Array]]) -> Array:
+    for step in steps:
+        T = step(T)
+    return T
+
+
+POSES: Mapping[str, Callable[[Array], Array]] = {
+    ", and ".join(filter(None, causes)): partial(
+        _apply, steps=(WAYS[causes[0]], CAMERAS[causes[1]], WORLDS[causes[2]])
+    )
+    for causes in product(WAYS, CAMERAS, WORLDS)
+    if any(causes)
+}
+"""Combinations of them."""
+LIKELY = {*WAYS, *CAMERAS, *WORLDS, *(cause for cause in POSES if GL_AXES in cause)}
+"""Those that the table alone may tell; of many, some fit by chance."""
 DEPTH_UNITS: Mapping[str, float] = {
     "millimetres": 1e3, "centimetres": 1e2, "tenths of a millimetre": 1e4, "kilometres": 1e-3,
 }  # fmt: skip
@@ -151,8 +176,8 @@ UNITS: Mapping[str, float] = {
 }  # fmt: skip
 """Ratios [1] of the units of poses and depth that are met, by what is said of them."""
 MIRRORED = (
-    "the images are mirrored: flip them left to right, with colour and masks; or the poses are left-handed, "
-    "as in Unity and Unreal: convert them"
+    "the images are mirrored: flip them left to right, with colour and masks, and set cx = width - 1 - cx; or "
+    "the poses are left-handed, as in Unity and Unreal: convert them"
 )
 """Causes of a mirrored world, and their remedies."""
 INCONSISTENT = (
@@ -259,7 +284,7 @@ def check_camera(view: View, max_coordinate: float) -> None:
     if float(view.depth.max(initial=0.0)) > max_coordinate:
         unit = describe_unit(view.depth[view.valid])
         reason = f"depth reaches {view.depth.max():.4g} m{unit}"
-        raise WrongViewError(view.name, reason, "give depth in metres")
+        raise WrongViewError(view.name, reason, f"give depth in metres ({DEPTH_SCALE})")
 
 
 def describe_camera(view: View) -> str:
@@ -335,7 +360,7 @@ def name_causes(view: View, max_tilt: float) -> list[str]:
     if plane.share < LARGE:
         return []
     normal = plane.normal_camera(view.K)
-    causes = [cause for cause, read in POSES.items() if _tilt(read(view.pose), normal) <= max_tilt]
+    causes = [c for c, read in POSES.items() if c in LIKELY and _tilt(read(view.pose), normal) <= max_tilt]
     if (K := scaled_camera(view)) is not None and _tilt(view.pose, plane.normal_camera(K)) <= max_tilt:
         causes.append(OTHER_CAMERA)
     readings = view.depth[view.valid]
@@ -488,7 +513,10 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
             except WrongViewError as error:
                 said["unit" if unit else error.remedy] = f"{error.reason}: {error.remedy}"
         if posed and not level:
-            causes = " or ".join(name_causes(bare, max_tilt))
+            each = name_causes(bare, max_tilt)
+            if OTHER_CAMERA in each and centre:
+                each[each.index(OTHER_CAMERA)], said["K"] = centre, ""
+            causes = " or ".join(each)
             said[causes] = causes
             conventions.add(causes)
         for key, text in said.items():
@@ -520,6 +548,7 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         if mounting and best in ("", EARLY, LATE) and usual.keys() <= {Z_UP}:
             usual = {mounting: mounting}
         elif best == OTHER_CAMERA:
+            usual = {key: text for key, text in usual.items() if key not in conventions}
             usual["K"] = centre or OTHER_CAMERA
         elif best in UNITS and "unit" in usual:
             factor, length = UNITS[best], usual["unit"].partition(",")[0]
