@@ -91,24 +91,24 @@ def test_focal_lengths_are_right_once_multiplied(sound, factor):
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_turned_images_are_right_once_turned_back(sound, quarters):
-    def turned(view, quarters, cx, cy):
-        K = view.K.copy()
-        K[:2, 2] = cx, cy
+def test_turned_images_are_right_once_their_poses_are_turned(sound, quarters):
+    def turned(view):
+        (height, width), (cx, cy), K = view.depth.shape, view.K[:2, 2], view.K.copy()
+        K[:2, 2] = ((cy, width - 1 - cx), (width - 1 - cx, height - 1 - cy), (height - 1 - cy, cx))[
+            quarters - 1
+        ]
         K[[0, 1], [0, 1]] = K[[0, 1], [0, 1]] if quarters % 2 == 0 else K[[1, 0], [1, 0]]
         return replace(view, depth=np.rot90(view.depth, quarters).copy(), rgb=None, labels=None, K=K)
 
-    height, width = sound[0].depth.shape
-    cx, cy = sound[0].K[:2, 2]
-    x, y = ((cy, width - 1 - cx), (width - 1 - cx, height - 1 - cy), (height - 1 - cy, cx))[quarters - 1]
-    spoilt = [turned(view, quarters, x, y) for view in sound]
+    spoilt = [turned(view) for view in sound]
     (problem,) = diagnose(spoilt, Config()).problems
-    back = int(re.search(r"np\.rot90\(image, (-?\d)\)", problem)[1])
-    assert ("swap fx and fy" in problem) == (quarters != 2)
-    height, width = spoilt[0].depth.shape
-    centre = re.search("cx, cy = (.+?)(?: with|$)", problem)[1]
-    centre = eval(centre, {"cx": x, "cy": y, "height": height, "width": width})
-    assert diagnose([turned(view, back, *centre) for view in spoilt], Config()).problems == []
+    R = eval(problem.partition("T_world_camera @ ")[2], {"np": np})
+    assert diagnose([view.with_pose(view.pose @ R) for view in spoilt], Config()).problems == []
+
+
+def test_a_table_tilted_in_all_views_is_not_passed_over(sound):
+    turn = transforms.rigid(transforms.rotation_from_vector(np.array([1.9, 0.0, 0.0])), np.zeros(3))
+    assert diagnose([view.with_pose(turn @ view.pose) for view in sound], Config()).problems
 
 
 def test_the_report_says_what_is_wrong_above_the_pictures(sound, tmp_path, capsys):

@@ -59,7 +59,11 @@ def check_views(command: Check) -> int:
     said = "".join(f"wrong: {problem}\n" for problem in found.problems)
     said += "".join(f"not confirmed: {doubt}\n" for doubt in found.doubts)
     if found.problems:
-        said += "Mend this, or give the options named here to every command, and check again.\n"
+        said += (
+            "Mend this, or give the options named here to every command, and check again. In a "
+            "scene_camera.json, K is cam_K, depth is multiplied by depth_scale, and cam_R_w2c and "
+            "cam_t_w2c [mm] are the inverse of T_world_camera.\n"
+        )
     said += "" if said else "nothing is wrong\n"
     shown = table(f"{source}: {count_of(len(rows), 'view')}", [*columns.values()], rows, figures=True)
     if command.report is not None:

@@ -67,10 +67,7 @@ EARLY = "each pose is that of the view before: check the clocks of camera and po
 """A cause of wrong camera poses, and its remedy."""
 LATE = "each pose is that of the view after: check the clocks of camera and poses"
 """A cause of wrong camera poses, and its remedy."""
-OTHER_CAMERA = (
-    "K is for another resolution: multiply its first two rows (of cam_K in a recording) by the ratio of the "
-    "image sizes"
-)
+OTHER_CAMERA = "K is for another resolution: multiply its first two rows by the ratio of the image sizes"
 """A cause of wrong lengths, and its remedy."""
 GL_AXES = (
     "the camera axes are OpenGL's (y up, z backward) instead of OpenCV's (y down, z forward): give "
@@ -84,10 +81,7 @@ BODY_AXES = (
 """A cause of a wrong camera pose, and its remedy."""
 
 
-INVERSE = (
-    "T_world_camera is the inverse, world to camera (cam_R_w2c and cam_t_w2c of a recording are then camera "
-    "to world): invert it"
-)
+INVERSE = "T_world_camera is the inverse, world to camera: invert it"
 """A cause of a wrong camera pose, and its remedy."""
 
 
@@ -105,6 +99,11 @@ def _transpose_rotation(T: Array) -> Array:
     return transforms.rigid(T[:3, :3].T, T[:3, 3])
 
 
+def _rescale(factor: float) -> str:
+    """Say what undoes a factor."""
+    return f"divide it by {factor:.5g}" if factor > 1.0 else f"multiply it by {1.0 / factor:.5g}"
+
+
 def _scale_translation(T: Array, factor: float) -> Array:
     return transforms.rigid(T[:3, :3], factor * T[:3, 3])
 
@@ -114,12 +113,13 @@ CAMERAS: Mapping[str, Callable[[Array], Array]] = {
     GL_AXES: lambda T: T @ GL,
     BODY_AXES: lambda T: T @ BODY,
     **{
-        f"the image is turned by {angle}° against its pose: turn depth, colour and masks back with "
-        f"np.rot90(image, {quarters}), {camera}": partial(_turn_camera, angle=angle)
-        for angle, quarters, camera in (
-            (90, -1, "swap fx and fy, and set cx, cy = height - 1 - cy, cx with the height before"),
-            (180, 2, "and set cx, cy = width - 1 - cx, height - 1 - cy"),
-            (-90, 1, "swap fx and fy, and set cx, cy = cy, width - 1 - cx with the width before"),
+        f"the image is turned by {angle}° against its pose: give T_world_camera @ {matrix}": partial(
+            _turn_camera, angle=angle
+        )
+        for angle, matrix in (
+            (90, "[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
+            (180, "np.diag([-1, -1, 1, 1])"),
+            (-90, "[[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
         )
     },
 }
@@ -130,13 +130,15 @@ WORLDS: Mapping[str, Callable[[Array], Array]] = {
     f"the world's z axis points down: {Z_UP}": lambda T: GL @ T,
 }
 """The same of world frames."""
+REORDER = "give the rotation of T_world_camera whose quaternion is np.roll(quaternion as read"
+"""Remedy for a quaternion in another order."""
 WAYS: Mapping[str, Callable[[Array], Array]] = {
     "": lambda T: T,
     INVERSE: transforms.invert,
-    "the quaternion of the pose begins with w, but was read as x y z w: reorder it": partial(
+    f"the quaternion of the pose begins with w, but was read as x y z w: {REORDER}, -1)": partial(
         _roll_quaternion, by=-1
     ),
-    "the quaternion of the pose ends with w, but was read as w x y z: reorder it": partial(
+    f"the quaternion of the pose ends with w, but was read as w x y z: {REORDER}, 1)": partial(
         _roll_quaternion, by=1
     ),
 }
@@ -163,11 +165,9 @@ DEPTH_UNITS: Mapping[str, float] = {
     "millimetres": 1e3, "centimetres": 1e2, "tenths of a millimetre": 1e4, "kilometres": 1e-3,
 }  # fmt: skip
 """How many of the units that depth is met in make a metre [1]."""
-DEPTH_SCALE = "in a recording, pixels times depth_scale are in millimetres"
-"""How recordings give the unit of depth."""
 UNITS: Mapping[str, float] = {
-    f"the translation of T_world_camera is {1.0 / factor:.4g} times as long as depth says{unit}: give both in"
-    " metres; in a recording, cam_t_w2c is in millimetres, and depth_scale makes them of depth": factor
+    f"the translation of T_world_camera is {1.0 / factor:.4g} times as long as depth says{unit}: "
+    f"{_rescale(1.0 / factor)}, if depth is right": factor
     for factor, unit in {
         **dict.fromkeys((100.0, 39.37, 10.0, 5.0, 4.0, 2.0, 0.5, 0.25, 0.2), ""),
         1e3: ", as if in kilometres", 0.1: ", as if in decimetres", 0.0254: ", as if in inches",
@@ -176,8 +176,9 @@ UNITS: Mapping[str, float] = {
 }  # fmt: skip
 """Ratios [1] of the units of poses and depth that are met, by what is said of them."""
 MIRRORED = (
-    "the images are mirrored: flip them left to right, with colour and masks, and set cx = width - 1 - cx; or "
-    "the poses are left-handed, as in Unity and Unreal: convert them"
+    "the images are mirrored: flip them left to right, with colour and masks, and set cx = width - 1 - cx; "
+    "or the poses are left-handed, as in Unity and Unreal: give S @ T_world_camera @ S with "
+    "S = np.diag([-1, 1, 1, 1]); depth cannot tell which: the other one mirrors the world"
 )
 """Causes of a mirrored world, and their remedies."""
 INCONSISTENT = (
@@ -276,15 +277,13 @@ def check_camera(view: View, max_coordinate: float) -> None:
     far = 0.0 if view.T_world_camera is None else float(np.linalg.norm(view.T_world_camera[:3, 3]))
     if far > AWAY:
         reason = f"the camera is {far:.4g} m from the world's origin, as if in millimetres or centimetres"
-        remedy = (
-            "give T_world_camera in metres (cam_t_w2c of a recording in millimetres), in a world whose "
-            f"origin is within {AWAY:g} m"
-        )
+        remedy = f"give T_world_camera in metres, in a world whose origin is within {AWAY:g} m"
         raise WrongViewError(view.name, reason, remedy)
     if float(view.depth.max(initial=0.0)) > max_coordinate:
         unit = describe_unit(view.depth[view.valid])
-        reason = f"depth reaches {view.depth.max():.4g} m{unit}"
-        raise WrongViewError(view.name, reason, f"give depth in metres ({DEPTH_SCALE})")
+        raise WrongViewError(
+            view.name, f"depth reaches {view.depth.max():.4g} m{unit}", f"give depth in metres{_undo(unit)}"
+        )
 
 
 def describe_camera(view: View) -> str:
@@ -327,7 +326,7 @@ def describe_centre(view: View) -> str:
         return f"{where}; is K for another resolution?"
     scale = K[0, 0] / view.K[0, 0]
     whole = 8 * np.rint(size / scale / 8.0).astype(np.intp)  # as images are
-    remedy = f"multiply its first two rows by {size[0] / whole[0]:.6g} (those of cam_K in a recording)"
+    remedy = f"multiply its first two rows by {size[0] / whole[0]:.3g}, the ratio of the image sizes"
     return f"{where}; if K is for a resolution of {whole[0]}×{whole[1]}, {remedy}"
 
 
@@ -506,7 +505,7 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         # Parts of images have their principal point anywhere.
         said = {"": "", "K": "" if level else centre}
         if unit := describe_unit(view.depth[view.valid]):
-            said["unit"] = f"depth is {near:.4g}–{far:.4g} m{unit}: give metres ({DEPTH_SCALE})"
+            said["unit"] = f"depth is {near:.4g}–{far:.4g} m{unit}: give metres{_undo(unit)}"
         for check in (partial(check_camera, max_coordinate=config.cloud.max_coordinate), check_depth):
             try:
                 check(view)
@@ -553,10 +552,7 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         elif best in UNITS and "unit" in usual:
             factor, length = UNITS[best], usual["unit"].partition(",")[0]
             named = {k: f" as if in {unit}," for unit, k in DEPTH_UNITS.items()}.get(factor, "")
-            usual["unit"] = (
-                f"{length},{named} {factor:.4g} times as long as by the poses: divide it by {factor:.4g} "
-                f"({DEPTH_SCALE})"
-            )
+            usual["unit"] = f"{length},{named} {factor:.4g} times as long as by the poses: {_rescale(factor)}"
         elif best:
             usual = {key: text for key, text in usual.items() if key not in conventions} | {best: best}
         elif _have_one_pose(thin):
@@ -627,7 +623,7 @@ def _is_level_somewhere(view: View, max_tilt: float) -> bool:
     for _ in range(PLANES):
         plane = find_image_plane(view)
         if plane.share == 0.0 or _tilt(view.pose, plane.normal_camera(view.K)) <= max_tilt:
-            return plane.share > 0.0
+            return plane.share >= LARGE
         view = replace(view, depth=np.where(plane.mask(view), np.float32(0.0), view.depth))
     return False
 
@@ -642,3 +638,8 @@ def describe_unit(readings: NDArray[np.floating]) -> str:
     median, counts = float(np.median(readings)), {"": 1.0, **DEPTH_UNITS}
     unit = min(counts, key=lambda name: abs(np.log(median / counts[name])))
     return f", as if in {unit}" if unit else ""
+
+
+def _undo(unit: str) -> str:
+    """Say how to convert readings that `describe_unit` says something of to metres."""
+    return "".join(f": {_rescale(k)}" for name, k in DEPTH_UNITS.items() if unit.endswith(name))
