@@ -533,6 +533,10 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         thin += [bare] if posed else []
     # One view may show a wall, and no table.
     usual = {key: texts[0] for key, texts in found.items() if 2 * len(texts) > len(rows)}
+    tilted = sum(len(found[key]) for key in conventions)
+    if 2 * tilted > len(rows) and not conventions & usual.keys():
+        usual[Z_UP] = Z_UP
+        conventions.add(Z_UP)
     if Z_UP in usual:
         normals = np.array([transforms.rotate(v.pose, find_image_plane(v).normal_camera(v.K)) for v in thin])
         if _median_angle(normals, np.median(normals, axis=0)) > max_tilt:
@@ -620,11 +624,14 @@ def _median_angle(a: Array, b: Array) -> float:
 
 def _is_level_somewhere(view: View, max_tilt: float) -> bool:
     """Whether one of the largest planes of a view with a pose is level."""
+    enough = LARGE * np.count_nonzero(view.valid)
     for _ in range(PLANES):
         plane = find_image_plane(view)
         if plane.share == 0.0 or _tilt(view.pose, plane.normal_camera(view.K)) <= max_tilt:
-            return plane.share >= LARGE
+            return plane.share > 0.0
         view = replace(view, depth=np.where(plane.mask(view), np.float32(0.0), view.depth))
+        if np.count_nonzero(view.valid) < enough:  # Small planes are level by chance.
+            return False
     return False
 
 
