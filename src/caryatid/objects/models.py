@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from caryatid.config import Config, SegmentationConfig
 from caryatid.fitting.primitives import Fit, FitFailure, fit
+from caryatid.geometry import transforms
 from caryatid.geometry.points import last_in_voxels, most_central, rotate, transform
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
@@ -39,6 +40,8 @@ from caryatid.sensing.clouds import thin
 from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud
 from caryatid.sensing.voxel_map import VoxelMap
 
+GRAZING = float(np.cos(np.radians(75.0)))
+"""Cosine of the angle of incidence beyond which readings are not trusted if another view shows more [1]."""
 OtherColour = Callable[[int, NDArray[np.intp]], NDArray[np.bool_]]
 """Which points of an index (M,) have another colour than the object of a name: (M,)."""
 
@@ -58,6 +61,7 @@ class ObjectPoints:
         self._cloud = Cloud(np.zeros((0, 3)), np.zeros((0, 3)))
         self._labels = np.zeros(0, dtype=np.int32)
         self._views = np.zeros(0, dtype=np.int32)
+        self._grazed = np.zeros(0, dtype=np.bool_)
         self._colourless: frozenset[int] = frozenset()
         self._selected: dict[tuple[int, float], Cloud] = {}
 
@@ -68,7 +72,11 @@ class ObjectPoints:
         return other
 
     def add(self, cloud: Cloud, labels: NDArray[np.int32], view: int) -> None:
-        """Add a view's points with their labels (N,); colours stay where all points have them."""
+        """Add a view's points with their labels (N,); colours stay where all points have them.
+
+        An object that several views show loses its points seen at a grazing angle: beside an edge, sensors
+        read ramps from it to what lies behind.
+        """
         order = np.argsort(labels, kind="stable")
         labels, cloud, known = labels[order], cloud.select(order), self._cloud
         after = np.searchsorted(self._labels, labels, side="right")
@@ -82,9 +90,17 @@ class ObjectPoints:
         )
         self._views = np.insert(self._views, after, view)
         self._labels = np.insert(self._labels, after, labels)
+        self._grazed = np.insert(self._grazed, after, is_grazed(cloud))
         changed = set(np.unique(labels).tolist())
         self._forget(changed)
         self.labels_used = max(self.labels_used, *(k for k in changed if k <= MAX_LABEL), 0)
+        kept = np.ones(len(self._labels), dtype=np.bool_)
+        for label in (k for k in changed if k <= MAX_LABEL):
+            rows = self._rows(label)
+            if (self._views[rows] != view).any() and not self._grazed[rows].all():
+                kept[rows] = ~self._grazed[rows]
+        if not kept.all():
+            self._keep(np.flatnonzero(kept), self._labels, changed)
 
     def put(self, cloud: Cloud, label: int, view: int) -> None:
         """Add points of an object that no view showed; its colour stays unknown."""
@@ -191,10 +207,19 @@ class ObjectPoints:
         """Keep these rows, in this order, with the labels (N,) of all; forget what was selected of some."""
         rows = rows[np.argsort(labels[rows], kind="stable")]
         self._cloud, self._views, self._labels = self._cloud.select(rows), self._views[rows], labels[rows]
+        self._grazed = self._grazed[rows]
         self._forget(changed)
 
     def _forget(self, labels: set[int]) -> None:
         self._selected = {key: held for key, held in self._selected.items() if key[0] not in labels}
+
+
+def is_grazed(cloud: Cloud) -> NDArray[np.bool_]:
+    """Which points (N,) the sensor saw at a grazing angle."""
+    if cloud.viewpoint_world is None:
+        return np.zeros(len(cloud), dtype=np.bool_)
+    rays = transforms.unit(cloud.viewpoint_world - cloud.points_world)
+    return np.asarray(np.einsum("ij,ij->i", rays, cloud.normals_world) < GRAZING, dtype=np.bool_)
 
 
 class ObjectModels:
