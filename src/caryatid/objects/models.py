@@ -36,12 +36,10 @@ from caryatid.objects.reasons import Reasons, explain_object, explain_pair
 from caryatid.objects.solids import as_solid
 from caryatid.runtime.parallel import on_threads
 from caryatid.segmentation.observation import Observation
-from caryatid.sensing.clouds import thin
+from caryatid.sensing.clouds import GRAZING, thin
 from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud
 from caryatid.sensing.voxel_map import VoxelMap
 
-GRAZING = float(np.cos(np.radians(75.0)))
-"""Cosine of the angle of incidence beyond which readings are not trusted if another view shows more [1]."""
 OtherColour = Callable[[int, NDArray[np.intp]], NDArray[np.bool_]]
 """Which points of an index (M,) have another colour than the object of a name: (M,)."""
 

@@ -12,13 +12,10 @@ from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, inner, kernel, on_threads
 from caryatid.segmentation.support_plane import SupportSurface
-from caryatid.sensing.clouds import slope_limit
+from caryatid.sensing.clouds import GRAZING, slope_limit
 from caryatid.sensing.views import View
 
 Labels = NDArray[np.int32]
-
-GRAZING = float(np.cos(np.radians(80.0)))
-"""Cosine of the angle of incidence beyond which a sensor reads no surface [1]: such a reading mixes two."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

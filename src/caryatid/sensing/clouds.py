@@ -21,6 +21,9 @@ Image = NDArray[np.float32]
 ZERO = np.float32(0.0)
 """Keeps sums and comparisons in single precision."""
 
+GRAZING = float(np.cos(np.radians(80.0)))
+"""Cosine of the angle of incidence beyond which a sensor reads no surface [1]: such a reading mixes two."""
+
 
 def oriented_points(
     view: View, config: CloudConfig, *, among: NDArray[np.bool_] | None = None
