@@ -435,3 +435,15 @@ def test_the_terms_of_an_object_add_up_and_nothing_that_pays_is_left(sample_auto
     for wrong in (["o99"], [ids[0], ids[0]], ["o0"]):
         with pytest.raises(InputError):
             scene.why(*wrong)
+
+
+def test_a_first_view_of_the_floor_alone_does_not_hide_the_table():
+    boxes = [(np.array([x, 0.1, TABLE + 0.05]), np.full(3, 0.1)) for x in (-0.12, 0.12)]
+    floor = table_scene(transforms.look_at([-1.5, 0.0, 1.5], [-2.2, 0.0, 0.0]), boxes)
+    table = table_scene(from_the_side(), boxes)
+    scene = Scene(segmentation="auto")
+    for view in (replace(view, labels=None) for view in (floor, table)):
+        scene.update(view)
+    assert scene.views == 2
+    assert scene.surface.point_world[2] == pytest.approx(TABLE, abs=0.005)
+    assert sorted(s.supporter for s in scene.graph.supports) == ["o0", "o0"]

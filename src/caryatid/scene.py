@@ -124,6 +124,7 @@ class Scene(Pictured):
         self.T_world_cameras: tuple[Array, ...] = ()
         self.views = 0
         self.waiting: tuple[View, ...] = ()
+        self._bare: tuple[View | Cloud, ...] = ()
         self.changed = False
         self.identified = False
         self.timings: dict[str, float] = {}
@@ -409,6 +410,7 @@ class Scene(Pictured):
             waiting, self.waiting = self.waiting, ()
             for view in (*waiting, source):
                 try:
+                    self._start_again(view)
                     self._take_in(view)
                 except WrongViewError as error:
                     if view is source:
@@ -416,18 +418,42 @@ class Scene(Pictured):
                     log.warning(LEFT_OUT, error)
                 else:
                     self._labelled = labelled
+                    bare = not self._models.points.objects and len(self._bare) == self.views - 1
+                    self._bare = (*self._bare, view) if bare else ()
                     yield view
         except NoSurfaceError:
             if isinstance(source, View) and source.T_world_camera is not None:
                 self.waiting, self._labelled = (*self.waiting, source), labelled
             raise
 
-    def _observed(self, source: View | Cloud) -> Observation:
+    def _start_again(self, source: View | Cloud) -> None:
+        """Take all views in again, with the table of this one, if nothing stands on what they show.
+
+        They may show the floor alone.
+        """
+        if not self._bare:
+            return
+        try:
+            found = self._observed(source, anew=True)
+        except NoSurfaceError:
+            return
+        if not found.shown_objects or found.surface.continues(self.surfaces[0], self.config.surface):
+            return
+        views, first = self._bare, self._first
+        vars(self).update(vars(type(self)(self.config, segmentation=self.segmentation, seed=self.seed)))
+        self.surfaces, self._first = found.surfaces, first
+        for view in views:
+            try:
+                self._take_in(view)
+            except WrongViewError as error:
+                log.warning(LEFT_OUT, error)
+
+    def _observed(self, source: View | Cloud, *, anew: bool = False) -> Observation:
         rng = np.random.default_rng([self.seed, self.views])
         carrying = {SUPPORT_LABEL - o.label for o in self.graph.support_surfaces}
         return observe(
-            source, self.config,
-            segmentation=self.segmentation, known=self.surfaces, carrying=carrying, rng=rng,
+            source, self.config, segmentation=self.segmentation, known=() if anew else self.surfaces,
+            carrying=frozenset() if anew else carrying, rng=rng,
         )  # fmt: skip
 
     @one_blas_thread

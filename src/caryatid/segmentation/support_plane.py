@@ -424,7 +424,7 @@ def find_support_surfaces(
         surfaces.append(surface if same is None else same.placed(surface.point_world))
         left &= ~near
     planes: list[_Plane] = []
-    left, most = (_some(left, 1_000), 2) if known else (left, MOST_PLANES)
+    left, most = (_some(left, 5_000), 2) if known else (left, MOST_PLANES)
     while len(planes) < most and (plane := scene.largest_plane(left, rng)):
         planes.append(plane)
         left = left & (np.abs(points @ plane.normal - plane.offset) > 2.0 * config.tolerance)
