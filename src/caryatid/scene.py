@@ -494,7 +494,7 @@ class Scene(Pictured):
             observation, new = self._associate_segments(observation, given, new)
         if named and self.views:
             self._check_identity(observation, source.name)
-        shown = self._models.add(observation, self.views) | moved
+        shown = self._models.add(observation, self.views, masked=given) | moved
         self.surfaces = self._fused_surfaces(observation)
         voxels = self._mapped(observation)
         watch.lap("map")

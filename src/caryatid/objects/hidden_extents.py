@@ -11,7 +11,7 @@ from caryatid.config import CompletionConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Cylinder, Primitives, Shape, Sphere
 from caryatid.geometry.solids import Solid
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.transforms import UP, Array
 from caryatid.graph import SceneObject
 from caryatid.segmentation.support_plane import SupportSurface, find_surface_below
 from caryatid.sensing.voxel_map import FREE, VoxelMap
@@ -20,6 +20,9 @@ SPACING = 0.015
 """Spacing of the points tested on the moving side [m]."""
 LEAST = 0.0005
 """Smaller gaps do not count [m]."""
+THIN = 0.01
+"""A side this close to the opposite one may lie inside what is below [m]; fits are at least 8 mm deep."""
+
 
 Face = tuple[Array, Array]
 """Points (N, 3) [m] all over a side, and its rim (M, 3)."""
@@ -46,10 +49,12 @@ def complete(
     shapes = [o.shape for o in objects]
     done = [_raise_upper_side(o, shapes[:k] + shapes[k + 1 :], voxels, config) for k, o in enumerate(objects)]
     lowest = [o.shape.surface(SPACING)[0][:, 2].min() for o in objects]
+    tops = [o.centre_world[2] + o.shape.support(UP[None])[0] for o in done]
     for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
         others = [o.shape for n, o in enumerate(done) if n != k]
+        lower = [o.shape for o, top in zip(done, tops, strict=True) if top < tops[k]]
         surface = surfaces[find_surface_below(surfaces, done[k].centre_world[None])[0]]
-        done[k] = _extend_downwards(done[k], others, surface, voxels, config)
+        done[k] = _extend_downwards(done[k], others, lower, surface, voxels, config)
     return done
 
 
@@ -96,13 +101,14 @@ def _variance(shown: float, room: float, put: float) -> float:
 def _extend_downwards(
     candidate: SceneObject,
     others: Sequence[Shape],
+    lower: Sequence[Shape],
     surface: SupportSurface,
     voxels: VoxelMap,
     config: CompletionConfig,
 ) -> SceneObject:
     """Extend an object's unseen lower side down to the table, another shape or free space.
 
-    If that lies below the table, it is raised instead.
+    If that lies below the table, or a thin object reaches into a lower shape, it is raised instead.
     """
     shape = candidate.shape
     if isinstance(shape, Sphere):
@@ -115,6 +121,12 @@ def _extend_downwards(
     points, rim = _face(shape, axis, sign)
     length = float(surface.height(points).min()) / -float(down_world @ surface.normal_world)
     across = np.delete(shape.T_world_object[:3, :3], axis, axis=1)
+    shown = float(shape.extents[axis])
+    if lower and shown < THIN:
+        # As deep as a fit must be at least, it may reach into what it lies on.
+        top = _inwards(_face(shape, axis, -sign)[0], across, config.overlap)
+        room = _way_to_others(top, down_world, shown, lower, replace(config, overlap=0.0))
+        length = min(length, room - shown) if room < shown else length
     if length <= 0.0:
         return replace(candidate, shape=_lengthened(shape, axis, sign, length))
     reason = "is assumed to reach down to the table"

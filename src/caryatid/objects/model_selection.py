@@ -161,11 +161,22 @@ def best_division(
     tried = sorted(sorted(shaped, key=shaped.__getitem__)[:2])
     hinted = sum(k < hinted for k in tried)
     settled = _settled(evidence, [starts[k] for k in tried], hinted, near, config, rng)
-    return min(settled.values(), key=lambda two: two.cost, default=None)
+    proper = [two for two in settled.values() if two.by_colour or not _is_layer(evidence, two)]
+    return min(proper, key=lambda two: two.cost, default=None)
 
 
 def _colours(evidence: Evidence, second: Mask, costs: ExplanationConfig) -> float:
     return colour_evidence(evidence.select(~second), evidence.select(second), costs)
+
+
+def _is_layer(evidence: Evidence, two: TwoObjects) -> bool:
+    """Whether one side is only a layer of points on the other's surface, left by a misaligned view."""
+    sides = evidence.points[two.second], evidence.points[~two.second]
+    # 9 mm: a view that is off by 3σ leaves points that far from a surface.
+    return any(
+        isinstance(other.shape, Shape) and float((other.shape.signed_distance(side) < 0.009).mean()) >= 0.8
+        for side, other in zip(sides, two.explanations, strict=True)
+    )
 
 
 def _settled(

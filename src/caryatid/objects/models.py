@@ -69,12 +69,8 @@ class ObjectPoints:
         other._selected = self._selected.copy()
         return other
 
-    def add(self, cloud: Cloud, labels: NDArray[np.int32], view: int) -> None:
-        """Add a view's points with their labels (N,); colours stay where all points have them.
-
-        An object that several views show loses its points seen at a grazing angle: beside an edge, sensors
-        read ramps from it to what lies behind.
-        """
+    def add(self, cloud: Cloud, labels: NDArray[np.int32], view: int, *, masked: bool = True) -> None:
+        """Add a view's points with their labels (N,), from masks or not; colours stay if all have them."""
         order = np.argsort(labels, kind="stable")
         labels, cloud, known = labels[order], cloud.select(order), self._cloud
         after = np.searchsorted(self._labels, labels, side="right")
@@ -88,17 +84,10 @@ class ObjectPoints:
         )
         self._views = np.insert(self._views, after, view)
         self._labels = np.insert(self._labels, after, labels)
-        self._grazed = np.insert(self._grazed, after, is_grazed(cloud))
+        self._grazed = np.insert(self._grazed, after, False if masked else is_grazed(cloud))
         changed = set(np.unique(labels).tolist())
         self._forget(changed)
         self.labels_used = max(self.labels_used, *(k for k in changed if k <= MAX_LABEL), 0)
-        kept = np.ones(len(self._labels), dtype=np.bool_)
-        for label in (k for k in changed if k <= MAX_LABEL):
-            rows = self._rows(label)
-            if (self._views[rows] != view).any() and not self._grazed[rows].all():
-                kept[rows] = ~self._grazed[rows]
-        if not kept.all():
-            self._keep(np.flatnonzero(kept), self._labels, changed)
 
     def put(self, cloud: Cloud, label: int, view: int) -> None:
         """Add points of an object that no view showed; its colour stays unknown."""
@@ -113,13 +102,20 @@ class ObjectPoints:
         return [k for k in labels if k <= MAX_LABEL]
 
     def of(self, label: int, edge: float = 0.0) -> Cloud:
-        """Points of an object: all, or of those in each voxel of this edge [m] the one nearest their mean."""
+        """Points of an object: all, or of those in each voxel of this edge [m] the one nearest their mean.
+
+        If several views show the object, those seen at a grazing angle are then left out: beside an edge,
+        sensors read ramps from it to what lies behind. Masks end before.
+        """
         if not edge:
             rows, cloud = self._rows(label), self._cloud
             rgb = None if cloud.rgb is None or label in self._colourless else cloud.rgb[rows]
             return Cloud(cloud.points_world[rows], cloud.normals_world[rows], self._labels[rows], rgb)
         if (label, edge) not in self._selected:
-            cloud = self.of(label)
+            cloud, rows = self.of(label), self._rows(label)
+            several = (self._views[rows] != self._views[rows][:1]).any()
+            if several and not self._grazed[rows].all():
+                cloud = cloud.select(~self._grazed[rows])
             self._selected[label, edge] = cloud.select(thin(cloud.points_world, edge))
         return self._selected[label, edge]
 
@@ -373,7 +369,7 @@ class ObjectModels:
             on_another |= (shown != o.label) & (share >= 0.5)
         return int(np.count_nonzero(on_another & (own < config.overlap))), len(shown)
 
-    def add(self, observation: Observation, view: int) -> set[int]:
+    def add(self, observation: Observation, view: int, *, masked: bool) -> set[int]:
         """Add a view's points, thinned, and return the labels of the objects among them."""
         config = self._config
         shown = set(observation.shown) - {0}
@@ -381,7 +377,7 @@ class ObjectModels:
         voxels[0] = 0.0
         voxels[MAX_LABEL + 1 :] = config.surface.spacing
         kept = most_central(observation.cloud.points_world, observation.labels, voxels)
-        self.points.add(observation.cloud.select(kept), observation.labels[kept], view)
+        self.points.add(observation.cloud.select(kept), observation.labels[kept], view, masked=masked)
         edges = {label: float(voxels[label]) for label in shown}
         self.points.bound(edges, config.cloud.views, config.cloud.depth)
         return {label for label in shown if label <= MAX_LABEL}
