@@ -418,7 +418,9 @@ class Scene(Pictured):
                     log.warning(LEFT_OUT, error)
                 else:
                     self._labelled = labelled
-                    bare = not self._models.points.objects and len(self._bare) == self.views - 1
+                    # A table that so many views show empty is one.
+                    bare = self.views <= self.config.cloud.views and not self._models.points.objects
+                    bare &= len(self._bare) == self.views - 1
                     self._bare = (*self._bare, view) if bare else ()
                     yield view
         except NoSurfaceError:

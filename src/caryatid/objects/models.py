@@ -59,7 +59,7 @@ class ObjectPoints:
         self._cloud = Cloud(np.zeros((0, 3)), np.zeros((0, 3)))
         self._labels = np.zeros(0, dtype=np.int32)
         self._views = np.zeros(0, dtype=np.int32)
-        self._grazed = np.zeros(0, dtype=np.bool_)
+        self._grazing_mask = np.zeros(0, dtype=np.bool_)
         self._colourless: frozenset[int] = frozenset()
         self._selected: dict[tuple[int, float], Cloud] = {}
 
@@ -84,7 +84,9 @@ class ObjectPoints:
         )
         self._views = np.insert(self._views, after, view)
         self._labels = np.insert(self._labels, after, labels)
-        self._grazed = np.insert(self._grazed, after, False if masked else is_grazed(cloud))
+        self._grazing_mask = np.insert(
+            self._grazing_mask, after, False if masked else _find_grazing_mask(cloud)
+        )
         changed = set(np.unique(labels).tolist())
         self._forget(changed)
         self.labels_used = max(self.labels_used, *(k for k in changed if k <= MAX_LABEL), 0)
@@ -104,8 +106,8 @@ class ObjectPoints:
     def of(self, label: int, edge: float = 0.0) -> Cloud:
         """Points of an object: all, or of those in each voxel of this edge [m] the one nearest their mean.
 
-        If several views show the object, those seen at a grazing angle are then left out: beside an edge,
-        sensors read ramps from it to what lies behind. Masks end before.
+        If several views show the object, the latter omit points seen at a grazing angle: beside an edge,
+        sensors read ramps from it to what lies behind. Points from masks all count.
         """
         if not edge:
             rows, cloud = self._rows(label), self._cloud
@@ -114,8 +116,8 @@ class ObjectPoints:
         if (label, edge) not in self._selected:
             cloud, rows = self.of(label), self._rows(label)
             several = (self._views[rows] != self._views[rows][:1]).any()
-            if several and not self._grazed[rows].all():
-                cloud = cloud.select(~self._grazed[rows])
+            if several and not self._grazing_mask[rows].all():
+                cloud = cloud.select(~self._grazing_mask[rows])
             self._selected[label, edge] = cloud.select(thin(cloud.points_world, edge))
         return self._selected[label, edge]
 
@@ -201,14 +203,14 @@ class ObjectPoints:
         """Keep these rows, in this order, with the labels (N,) of all; forget what was selected of some."""
         rows = rows[np.argsort(labels[rows], kind="stable")]
         self._cloud, self._views, self._labels = self._cloud.select(rows), self._views[rows], labels[rows]
-        self._grazed = self._grazed[rows]
+        self._grazing_mask = self._grazing_mask[rows]
         self._forget(changed)
 
     def _forget(self, labels: set[int]) -> None:
         self._selected = {key: held for key, held in self._selected.items() if key[0] not in labels}
 
 
-def is_grazed(cloud: Cloud) -> NDArray[np.bool_]:
+def _find_grazing_mask(cloud: Cloud) -> NDArray[np.bool_]:
     """Which points (N,) the sensor saw at a grazing angle."""
     if cloud.viewpoint_world is None:
         return np.zeros(len(cloud), dtype=np.bool_)
