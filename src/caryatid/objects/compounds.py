@@ -85,26 +85,29 @@ class Revolution:
             least = np.minimum(least, own)
         return least
 
-    def free(self, voxels: VoxelMap) -> int:
-        """Number of voxels of its surface seen free, all around; it may be hollow."""
-        size, rings, outward = voxels.config.size, [], []
+    def surface(self, spacing: float) -> tuple[Array, Array]:
+        """Points (N, 3) of its faces, this far from each other all around [m], outward normals (N, 3)."""
+        rings, outward = [], []
         for (begin, end), facing in zip(self.ends, self.outward, strict=True):
-            rings.append(begin + _middles(float(np.linalg.norm(end - begin)) / size)[:, None] * (end - begin))
-            outward.append(np.tile(facing, (len(rings[-1]), 1)))
+            steps = _middles(float(np.linalg.norm(end - begin)) / spacing)[:, None]
+            rings.append(begin + steps * (end - begin))
+            outward.append(np.tile(facing, (len(steps), 1)))
         ring, facing = np.concatenate(rings), np.concatenate(outward)
-        number = np.maximum(np.round(2.0 * np.pi * ring[:, 0] / size).astype(np.intp), 1)
+        number = np.maximum(np.round(2.0 * np.pi * ring[:, 0] / spacing).astype(np.intp), 1)
         index = np.repeat(np.arange(len(ring)), number)
         first = np.cumsum(number) - number
         angle = 2.0 * np.pi * (np.arange(len(index)) - first[index]) / number[index]
         x, y = _across(self.axis)
         away = np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * y
+        places, normals = (at[index, :1] * away + at[index, 1:] * self.axis for at in (ring, facing))
+        return self.middle + places, normals
+
+    def free(self, voxels: VoxelMap) -> int:
+        """Number of voxels of its surface seen free, all around; it may be hollow."""
+        places, normals = self.surface(voxels.config.size)
         # The seen part of a surface may lie in the voxel behind.
-        here = ring[index, :, None]
-        behind = here - 0.5 * size * facing[index, :, None]
-        free = np.ones(len(index), dtype=np.bool_)
-        for at in (here, behind):
-            free &= voxels.empty_at(self.middle + at[:, 0] * away + at[:, 1] * self.axis)
-        return int(np.count_nonzero(free))
+        behind = places - 0.5 * voxels.config.size * normals
+        return int(np.count_nonzero(voxels.empty_at(places) & voxels.empty_at(behind)))
 
 
 def revolutions(
@@ -254,6 +257,11 @@ class OpenBox:
         """Cost (N,) [nats] of oriented points (N, 3), each on the slab that explains it best."""
         slabs = [shape_costs(slab, points, normals, noise, config) for slab in self.slabs]
         return np.min(slabs, axis=0)
+
+    def surface(self, spacing: float) -> tuple[Array, Array]:
+        """Points (N, 3) of its slabs, this far from each other [m], and outward normals (N, 3)."""
+        points, normals = zip(*(slab.surface(spacing) for slab in self.slabs), strict=True)
+        return np.concatenate(points), np.concatenate(normals)
 
     def free(self, voxels: VoxelMap) -> int:
         """Number of voxels seen free that it fills, with free ones on either side."""

@@ -90,7 +90,7 @@ def split(
         Group of each point (N,), from 0, or None where one object is the better explanation.
     """
     if not explained(whole, evidence, config.explanation):
-        pieces = _separated_pieces(evidence, config)
+        pieces = find_separated(evidence, config.explanation.reach, config.split.min_points)
         if pieces is not None:
             return pieces
     hints = evidence.shown(config.split.min_points)
@@ -250,18 +250,22 @@ def _hypotheses(evidence: Evidence, misfit: Array, config: Config) -> Iterator[M
             yield height > level
 
 
-def _separated_pieces(evidence: Evidence, config: Config) -> Groups | None:
-    """Piece (N,) of each point where free space parts the largest from others, or None where none is."""
+def find_separated(evidence: Evidence, reach: float, least: int) -> Groups | None:
+    """Find pieces of at least some points that a gap beyond a reach [m] and free space part from the largest.
+
+    Returns:
+        Piece (N,) of each point, 0 = the largest and what is not parted from it, or None where none is.
+    """
     points, voxels = evidence.points, evidence.voxels
-    piece = _components(points, config.explanation.reach)
+    piece = _components(points, reach)
     sizes = np.bincount(piece)
-    if voxels is None or np.count_nonzero(sizes >= config.split.min_points) < 2:
+    if voxels is None or np.count_nonzero(sizes >= least) < 2:
         return None
     largest = int(sizes.argmax())
     body = points[piece == largest]
     tree = cKDTree(body)
     groups = np.zeros(len(points), dtype=np.intp)
-    for number in np.flatnonzero(sizes >= config.split.min_points):
+    for number in np.flatnonzero(sizes >= least):
         own = points[piece == number]
         gap, near = tree.query(own)
         begin, end = own[gap.argmin()], body[near[gap.argmin()]]

@@ -20,6 +20,7 @@ from caryatid.geometry.shapes import Shape, Uncertainty, fibonacci_sphere
 from caryatid.geometry.solids import Polytope, Solid, hollowed
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject
+from caryatid.objects.compounds import Compound
 from caryatid.objects.description_length import Evidence
 from caryatid.sensing.views import Cloud
 from caryatid.sensing.voxel_map import FREE, UNKNOWN, VoxelMap
@@ -35,7 +36,12 @@ ALIKE = float(np.cos(np.radians(18.0)))
 
 
 def as_solid(
-    fitted: SceneObject, cloud: Cloud, evidence: Evidence, others: Sequence[Shape], config: FitConfig
+    fitted: SceneObject,
+    cloud: Cloud,
+    evidence: Evidence,
+    backs: Sequence[Shape | Compound],
+    others: Sequence[Shape],
+    config: FitConfig,
 ) -> SceneObject:
     """Return an object with the solid of its points instead of its fitted primitive.
 
@@ -43,13 +49,14 @@ def as_solid(
         fitted: The object; it does not change if its points span no volume.
         cloud: Its points.
         evidence: Some of them, evenly spread, their noise, and the space seen free.
+        backs: Shapes whose surfaces in unseen space may be the object's.
         others: Shapes of the other objects near it.
         config: `min_extent` is the thickness of a wall seen from one side.
     """
     places, outward = _smoothed(cloud, evidence)
     if not len(places) or evidence.voxels is None:
         return fitted
-    solid = _solid(places, outward, _unseen(fitted.shape, places, others, evidence.voxels), evidence, config)
+    solid = _solid(places, outward, _unseen(backs, places, others, evidence.voxels), evidence, config)
     if solid is None:
         return fitted
     sides = np.stack([sign * outward[:, axis] for axis in range(3) for sign in (-1.0, 1.0)])
@@ -66,9 +73,11 @@ def as_solid(
     )
 
 
-def _unseen(shape: Shape, places: Array, others: Sequence[Shape], voxels: VoxelMap) -> Array:
-    """Points (M, 3) of a primitive in unseen space, as high as the object's: they may be its back."""
-    points = shape.surface(voxels.config.size)[0]
+def _unseen(
+    backs: Sequence[Shape | Compound], places: Array, others: Sequence[Shape], voxels: VoxelMap
+) -> Array:
+    """Points (M, 3) of shapes in unseen space, as high as the object's (N, 3)."""
+    points = np.concatenate([back.surface(voxels.config.size)[0] for back in backs])
     low, high = places[:, 2].min(), places[:, 2].max()
     points = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
     points = points[voxels.state_at(points) == UNKNOWN]

@@ -109,10 +109,13 @@ def segment(
     left_out = samples.image((proper & (part == 0)).astype(np.int32)) > 0
     waiting &= ~_enlarged(left_out, config.stride, waiting.shape)
     _spread_labels(labels[around], np.flatnonzero(waiting), view.depth[around], jump, rounds)
-    # The bottom of a bowl is as low as the surface's own readings.
+    # The bottom of a bowl is as low as the surface's own readings, and its walls go down to it; past a
+    # handle the camera sees the surface itself.
     bottom = _enlarged(np.append(part, np.int32(0))[inside], config.stride, waiting.shape)
-    bottom[~low[around] | (labels[around] > 0)] = 0
-    labels[around] += bottom
+    bottom_mask = low[around] & (labels[around] == 0) & (bottom > 0)
+    hollow = np.where(np.isin(labels[around], np.unique(bottom)), labels[around], np.int32(0))
+    _spread_labels(hollow, np.flatnonzero(bottom_mask), view.depth[around], jump, max(hollow.shape))
+    labels[around][bottom_mask] = hollow[bottom_mask]
     # What the margin cuts off goes on: a board may hang over the edge by more.
     beyond = surface.pixels_over(view, config.clearance, config.max_height) & ~foreground & ~elsewhere
     beyond &= (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
