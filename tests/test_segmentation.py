@@ -20,7 +20,7 @@ from caryatid.segmentation.observation import level_transform, observe
 from caryatid.sensing.clouds import oriented_points
 from caryatid.sensing.views import MAX_LABEL, Cloud, View
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.simulation.generation import bowl
+from caryatid.simulation.generation import bowl, mug
 from caryatid.simulation.world import Body, build_spec, scene_from_spec
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -184,6 +184,28 @@ def flush_boxes(left, right, line=0.0):
     border = np.argwhere(np.logical_and(*(ndimage.binary_dilation(mask, iterations=2) for mask in own)))
     rgb[tuple(border[: int(line * len(border))].T)] = 110.0
     return with_colours(view, rgb)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_table_past_a_handle_is_not_the_bottom_of_the_mug(seed):
+    base = Cylinder(transforms.rigid(np.eye(3), (0.0, 0.0, TABLE + 0.1)), 0.035, 0.2)
+    high = mug(np.random.default_rng(seed)).moved(transforms.rigid(np.eye(3), (0.0, 0.0, TABLE + 0.2)))
+    scene = scene_from_spec(build_spec([Body(base), Body(high)], "test"), "test", "test")
+    view = SimulatedCamera(scene, "carmine").capture(from_the_side(90.0, elevation=40.0, distance=1.0))
+    points, _, pixels = oriented_points(view, CloudConfig())
+    table = (view.labels.flat[pixels] == 0) & (points[:, 2] < TABLE + 0.01)
+    assert not labels_of(view).flat[pixels][table].any()
+
+
+def test_the_fringe_of_a_surface_has_its_colour_and_not_that_of_the_background():
+    view = table_scene(FRONT, [POST], sigma=0.001)
+    post = view.labels == 1
+    inside = ndimage.binary_erosion(post, np.ones((3, 3)), iterations=2)
+    view = with_colours(view, np.where(inside[..., None], BLUE, RED))
+    cloud = observe(view, Config(), segmentation="labels", known=(), rng=np.random.default_rng(0)).cloud
+    high = cloud.select((cloud.labels == 1) & (cloud.points_world[:, 2] > TABLE + 0.05))
+    assert np.count_nonzero(post & ~inside) > 0.1 * np.count_nonzero(post)
+    assert (high.rgb[:, 0] > high.rgb[:, 2]).mean() < 0.01
 
 
 @pytest.mark.parametrize(

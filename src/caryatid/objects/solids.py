@@ -1,9 +1,9 @@
 """Solids: the shape of an object that no primitive explains, its hull less the cavities seen in it.
 
-A solid is the convex hull of its points, and of the primitive fitted to them in unseen space, less convex
-cavities. A point of the object looks into a cavity if its normal leads through space seen free before it
-leaves the hull; the cavity lies in front of all the faces that look at that space. The other side of a wall
-seen from outside only, and of an unseen floor, is taken to be as near as that of the thinnest object.
+A solid is the convex hull of its points, and of what explains them in unseen space, less convex cavities. A
+point of the object looks into a cavity if its normal leads through space seen free before it leaves the hull;
+the cavity lies in front of all the faces that look at that space. The other side of a wall seen from outside
+only, and of an unseen floor, is taken to be as near as that of the thinnest object.
 """
 
 from __future__ import annotations

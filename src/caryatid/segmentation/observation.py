@@ -14,16 +14,19 @@ from caryatid.config import CloudConfig, Config, SegmentationMethod
 from caryatid.errors import InputError, NoSurfaceError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import UP, Array
+from caryatid.runtime.parallel import SHARES, for_each, kernel
 from caryatid.segmentation.diagnosis import describe_unit, name_causes
 from caryatid.segmentation.foreground import find_bodies, find_foreground, find_furniture
 from caryatid.segmentation.samples import Labels
 from caryatid.segmentation.seams import Pairs
-from caryatid.segmentation.segments import SMALLEST, segment, segment_cloud
+from caryatid.segmentation.segments import PLAIN, SMALLEST, colour_shares, segment, segment_cloud
 from caryatid.segmentation.support_plane import SupportSurface, find_support_surfaces, find_surface_below
 from caryatid.segmentation.void import VOID, is_void
-from caryatid.sensing.clouds import average_pixels, oriented_points, thin, working_distance
+from caryatid.sensing.clouds import average_pixels, oriented_points, slope_limit, thin, working_distance
 from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View
 
+FRINGE = 2
+"""Width of a surface's fringe in the colour of what lies behind [px]; half a window of stereo matching."""
 WHOLE = 0.1
 """A piece smaller than this share of a mask's largest body is a crumb [1]; something thin may cut a body."""
 
@@ -290,9 +293,78 @@ def _points(
     points, normals, pixels = oriented_points(source, config.cloud)
     if len(points) == 0:
         raise PerceptionError(f"{source.name}: {_why_nothing(source, config.cloud)}")
-    rgb = None if source.rgb is None else np.take(source.rgb.reshape(-1, 3), pixels, axis=0)
+    rgb = source.rgb
+    if rgb is not None:
+        depth, slope = source.depth, slope_limit(source.K[0, 0], config.cloud)
+        inverse_depth = np.divide(np.float32(1.0), depth, out=np.zeros_like(depth), where=source.valid)
+        rgb = _correct_colours(rgb, inverse_depth, config.cloud.edge_jump, slope)[pixels]
     eye = None if source.T_world_camera is None else source.T_world_camera[:3, 3]
     return Cloud(points, normals, None, rgb, eye, source.name), pixels
+
+
+def _correct_colours(
+    rgb: NDArray[np.uint8], inverse_depth: NDArray[np.float32], jump: float, slope: float
+) -> NDArray[np.uint8]:
+    """Give the fringe of each surface, which has the colour of what lies behind, that of its inside.
+
+    Where stereo matches windows, and where colour and depth are not exactly aligned, a surface seems to go on
+    beyond its outline.
+
+    Args:
+        rgb: Colours (H, W, 3).
+        inverse_depth: 1/z (H, W) [1/m], 0 = no reading.
+        jump: Largest step of it within one surface [1/m].
+        slope: Largest change of it within one surface in addition [1/m per px].
+
+    Returns:
+        Colours (H · W, 3).
+    """
+    near, around = (_steps(reach) for reach in (FRINGE, 2 * FRINGE))
+    near = near[np.abs(near).max(axis=1) == FRINGE]
+    nowhere = np.full(inverse_depth.shape, -1)
+    behind, inside = nowhere.copy(), nowhere.copy()
+    limits = np.float32(jump), np.float32(slope)
+    for_each(_find_nearest, SHARES, (inverse_depth, *limits, near, True, nowhere, behind))
+    for_each(_find_nearest, SHARES, (inverse_depth, *limits, around, False, behind, inside))
+    colours = rgb.reshape(-1, 3).copy()
+    fringe = np.flatnonzero(inside >= 0)
+    own, background, body = (
+        colour_shares(colours[at]) for at in (fringe, behind.flat[fringe], inside.flat[fringe])
+    )
+    to_background, to_body = (np.linalg.norm(own - other, axis=1) for other in (background, body))
+    wrong = fringe[to_background < np.minimum(to_body, 2.0 * PLAIN)]
+    colours[wrong] = rgb.reshape(-1, 3)[inside.flat[wrong]]
+    return colours
+
+
+def _steps(reach: int) -> NDArray[np.intp]:
+    """Steps (N, 2) of up to this many rows and columns, the shortest first."""
+    steps = np.argwhere(np.ones((2 * reach + 1, 2 * reach + 1))) - reach
+    return steps[np.argsort((steps**2).sum(axis=1), kind="stable")][1:]
+
+
+@kernel
+def _find_nearest(share, data):  # type: ignore[no-untyped-def]
+    """Write the first of the pixels some steps from each of every 16th row that is behind or on its surface.
+
+    A pixel is sought behind all; on their surface, off the fringe, for those on the fringe (H, W; −1 = off).
+    """
+    inverse_depth, jump, slope, steps, farther, fringe, found = data
+    height, width = inverse_depth.shape
+    for row in range(share, height, SHARES):
+        for column in range(width):
+            here = inverse_depth[row, column]
+            if here == 0.0 or (not farther and fringe[row, column] < 0):
+                continue
+            for k in range(len(steps)):
+                v, u = row + steps[k, 0], column + steps[k, 1]
+                if v < 0 or v >= height or u < 0 or u >= width or inverse_depth[v, u] == 0.0:
+                    continue
+                drop = here - inverse_depth[v, u]
+                limit = jump + slope * np.float32(max(abs(steps[k, 0]), abs(steps[k, 1])))
+                if (farther and drop > limit) or (not farther and abs(drop) <= limit and fringe[v, u] < 0):
+                    found[row, column] = v * width + u
+                    break
 
 
 def _why_nothing(view: View, config: CloudConfig) -> str:
