@@ -195,7 +195,12 @@ def observe(
         on_surface = (labels == 0) & surface.over(cloud.points_world, -reach, reach, reach)
         labels = np.where(on_surface, np.int32(SUPPORT_LABEL - k), labels)
     view = source if isinstance(source, View) else None
-    return Observation(view, replace(cloud, labels=labels), pixels, surfaces, apart, notes)
+    cloud = replace(cloud, labels=labels)
+    if view is not None and view.rgb is not None:
+        objects = pixels[(labels > 0) & (labels <= MAX_LABEL)]
+        colours = _correct_colours(view.rgb.reshape(-1, 3), view, objects, config.cloud)
+        cloud = replace(cloud, rgb=colours[pixels])
+    return Observation(view, cloud, pixels, surfaces, apart, notes)
 
 
 def segment_view(
@@ -293,48 +298,46 @@ def _points(
     points, normals, pixels = oriented_points(source, config.cloud)
     if len(points) == 0:
         raise PerceptionError(f"{source.name}: {_why_nothing(source, config.cloud)}")
-    rgb = source.rgb
-    if rgb is not None:
-        depth, slope = source.depth, slope_limit(source.K[0, 0], config.cloud)
-        inverse_depth = np.divide(np.float32(1.0), depth, out=np.zeros_like(depth), where=source.valid)
-        rgb = _correct_colours(rgb, inverse_depth, config.cloud.edge_jump, slope)[pixels]
+    rgb = None if source.rgb is None else np.take(source.rgb.reshape(-1, 3), pixels, axis=0)
     eye = None if source.T_world_camera is None else source.T_world_camera[:3, 3]
     return Cloud(points, normals, None, rgb, eye, source.name), pixels
 
 
 def _correct_colours(
-    rgb: NDArray[np.uint8], inverse_depth: NDArray[np.float32], jump: float, slope: float
+    colours: NDArray[np.uint8], view: View, pixels: NDArray[np.intp], config: CloudConfig
 ) -> NDArray[np.uint8]:
-    """Give the fringe of each surface, which has the colour of what lies behind, that of its inside.
+    """Give the fringe of each object, where it has the colour of what lies behind, that of its inside.
 
-    Where stereo matches windows, and where colour and depth are not exactly aligned, a surface seems to go on
+    Where stereo matches windows, and where colour and depth are not exactly aligned, an object seems to go on
     beyond its outline.
 
     Args:
-        rgb: Colours (H, W, 3).
-        inverse_depth: 1/z (H, W) [1/m], 0 = no reading.
-        jump: Largest step of it within one surface [1/m].
-        slope: Largest change of it within one surface in addition [1/m per px].
+        colours: Colours (H · W, 3) of the view.
+        view: The view.
+        pixels: Flat indices (N,) of the pixels that show objects.
+        config: Limits of one surface.
 
     Returns:
         Colours (H · W, 3).
     """
+    inverse_depth = np.divide(np.float32(1.0), view.depth, out=np.zeros_like(view.depth), where=view.valid)
+    limits = np.float32(config.edge_jump), np.float32(slope_limit(view.K[0, 0], config))
     near, around = (_steps(reach) for reach in (FRINGE, 2 * FRINGE))
     near = near[np.abs(near).max(axis=1) == FRINGE]
-    nowhere = np.full(inverse_depth.shape, -1)
-    behind, inside = nowhere.copy(), nowhere.copy()
-    limits = np.float32(jump), np.float32(slope)
-    for_each(_find_nearest, SHARES, (inverse_depth, *limits, near, True, nowhere, behind))
-    for_each(_find_nearest, SHARES, (inverse_depth, *limits, around, False, behind, inside))
-    colours = rgb.reshape(-1, 3).copy()
-    fringe = np.flatnonzero(inside >= 0)
-    own, background, body = (
-        colour_shares(colours[at]) for at in (fringe, behind.flat[fringe], inside.flat[fringe])
-    )
+    inside = np.full(view.depth.shape, -1)
+    behind = np.zeros_like(inside)
+    behind.flat[pixels] = -1
+    for_each(_find_nearest, SHARES, (inverse_depth, *limits, pixels, near, True, inside, behind))
+    fringe = pixels[behind.flat[pixels] >= 0]
+    for_each(_find_nearest, SHARES, (inverse_depth, *limits, fringe, around, False, behind, inside))
+    fringe = fringe[inside.flat[fringe] >= 0]
+    places = fringe, behind.flat[fringe], inside.flat[fringe]
+    own, background, body = (colour_shares(colours[place]) for place in places)
     to_background, to_body = (np.linalg.norm(own - other, axis=1) for other in (background, body))
-    wrong = fringe[to_background < np.minimum(to_body, 2.0 * PLAIN)]
-    colours[wrong] = rgb.reshape(-1, 3)[inside.flat[wrong]]
-    return colours
+    wrong = to_background < np.minimum(to_body, 2.0 * PLAIN)
+    corrected = colours.copy()
+    corrected[fringe[wrong]] = colours[inside.flat[fringe[wrong]]]
+    return corrected
 
 
 def _steps(reach: int) -> NDArray[np.intp]:
@@ -345,26 +348,23 @@ def _steps(reach: int) -> NDArray[np.intp]:
 
 @kernel
 def _find_nearest(share, data):  # type: ignore[no-untyped-def]
-    """Write the first of the pixels some steps from each of every 16th row that is behind or on its surface.
+    """Write the first pixel, some steps from every 16th of some pixels, that is behind it or on its surface.
 
-    A pixel is sought behind all; on their surface, off the fringe, for those on the fringe (H, W; −1 = off).
+    On its surface, only pixels count that show objects and are not on the fringe (H, W): those with −1.
     """
-    inverse_depth, jump, slope, steps, farther, fringe, found = data
+    inverse_depth, jump, slope, pixels, steps, farther, fringe, found = data
     height, width = inverse_depth.shape
-    for row in range(share, height, SHARES):
-        for column in range(width):
-            here = inverse_depth[row, column]
-            if here == 0.0 or (not farther and fringe[row, column] < 0):
+    for i in range(share, len(pixels), SHARES):
+        row, column = pixels[i] // width, pixels[i] % width
+        for k in range(len(steps)):
+            v, u = row + steps[k, 0], column + steps[k, 1]
+            if v < 0 or v >= height or u < 0 or u >= width or inverse_depth[v, u] == 0.0:
                 continue
-            for k in range(len(steps)):
-                v, u = row + steps[k, 0], column + steps[k, 1]
-                if v < 0 or v >= height or u < 0 or u >= width or inverse_depth[v, u] == 0.0:
-                    continue
-                drop = here - inverse_depth[v, u]
-                limit = jump + slope * np.float32(max(abs(steps[k, 0]), abs(steps[k, 1])))
-                if (farther and drop > limit) or (not farther and abs(drop) <= limit and fringe[v, u] < 0):
-                    found[row, column] = v * width + u
-                    break
+            drop = inverse_depth[row, column] - inverse_depth[v, u]
+            limit = jump + slope * np.float32(max(abs(steps[k, 0]), abs(steps[k, 1])))
+            if (farther and drop > limit) or (not farther and abs(drop) <= limit and fringe[v, u] < 0):
+                found[row, column] = v * width + u
+                break
 
 
 def _why_nothing(view: View, config: CloudConfig) -> str:
