@@ -90,7 +90,7 @@ def split(
         Group of each point (N,), from 0, or None where one object is the better explanation.
     """
     if not explained(whole, evidence, config.explanation):
-        pieces = find_separated(evidence, config.explanation.reach, config.split.min_points)
+        pieces = _separated_pieces(evidence, config)
         if pieces is not None:
             return pieces
     hints = evidence.shown(config.split.min_points)
@@ -250,14 +250,14 @@ def _hypotheses(evidence: Evidence, misfit: Array, config: Config) -> Iterator[M
             yield height > level
 
 
-def find_separated(evidence: Evidence, reach: float, least: int) -> Groups | None:
-    """Find pieces of at least some points that a gap beyond a reach [m] and free space part from the largest.
+def _separated_pieces(evidence: Evidence, config: Config) -> Groups | None:
+    """Find pieces beyond `explanation.reach` of the largest that free space parts from it.
 
     Returns:
         Piece (N,) of each point, 0 = the largest and what is not parted from it, or None where none is.
     """
-    points, voxels = evidence.points, evidence.voxels
-    piece = _components(points, reach)
+    points, voxels, least = evidence.points, evidence.voxels, config.split.min_points
+    piece = _components(points, config.explanation.reach)
     sizes = np.bincount(piece)
     if voxels is None or np.count_nonzero(sizes >= least) < 2:
         return None

@@ -31,7 +31,7 @@ from caryatid.objects.description_length import (
     explained,
     plain_colour,
 )
-from caryatid.objects.model_selection import GROWTH, best_merge, find_separated, split
+from caryatid.objects.model_selection import GROWTH, best_merge, split
 from caryatid.objects.reasons import Reasons, explain_object, explain_pair
 from caryatid.objects.solids import as_solid
 from caryatid.runtime.parallel import on_threads
@@ -486,9 +486,6 @@ class ObjectModels:
             others = [s for k, s in compress(shapes.items(), close) if k != label]
             whole = self._explained(label, noise, voxels, compound=True)[1].shape
             backs = [shape] if whole is None or whole is shape else [shape, whole]
-            # Pieces too small for objects of their own are stray readings.
-            pieces = find_separated(evidence, config.reach, 1)
-            evidence = evidence if pieces is None else evidence.select(pieces == 0)
             return as_solid(self.fits[label], cloud, evidence, backs, others, self._config.fit)
 
         for label, o in zip(changed, on_threads(formed, len(changed)), strict=True):

@@ -26,11 +26,10 @@ from caryatid.sensing.clouds import average_pixels, oriented_points, slope_limit
 from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View
 
 FRINGE = 2
-"""Width of a surface's fringe in the colour of what lies behind [px]; half a window of stereo matching."""
+"""Width of an object's fringe in the colour of what lies behind, in pixels of a resampled view [px]; half a
+window of stereo matching."""
 WHOLE = 0.1
 """A piece smaller than this share of a mask's largest body is a crumb [1]; something thin may cut a body."""
-
-
 ALONE = 0.7
 """Share of the points on the table's plane that a mask of the table has, and share of its points there [1]; a
 flat object leaves more of the table to see."""
@@ -198,8 +197,7 @@ def observe(
     cloud = replace(cloud, labels=labels)
     if view is not None and view.rgb is not None:
         objects = pixels[(labels > 0) & (labels <= MAX_LABEL)]
-        colours = _correct_colours(view.rgb.reshape(-1, 3), view, objects, config.cloud)
-        cloud = replace(cloud, rgb=colours[pixels])
+        cloud = replace(cloud, rgb=_correct_colours(view, objects, config.cloud)[pixels])
     return Observation(view, cloud, pixels, surfaces, apart, notes)
 
 
@@ -303,40 +301,39 @@ def _points(
     return Cloud(points, normals, None, rgb, eye, source.name), pixels
 
 
-def _correct_colours(
-    colours: NDArray[np.uint8], view: View, pixels: NDArray[np.intp], config: CloudConfig
-) -> NDArray[np.uint8]:
+def _correct_colours(view: View, objects: NDArray[np.intp], config: CloudConfig) -> NDArray[np.uint8]:
     """Give the fringe of each object, where it has the colour of what lies behind, that of its inside.
 
     Where stereo matches windows, and where colour and depth are not exactly aligned, an object seems to go on
     beyond its outline.
 
     Args:
-        colours: Colours (H · W, 3) of the view.
-        view: The view.
-        pixels: Flat indices (N,) of the pixels that show objects.
+        view: The view, which has colours.
+        objects: Flat indices (N,) of the pixels that show objects.
         config: Limits of one surface.
 
     Returns:
         Colours (H · W, 3).
     """
-    inverse_depth = np.divide(np.float32(1.0), view.depth, out=np.zeros_like(view.depth), where=view.valid)
+    assert view.rgb is not None
+    colours = view.rgb.reshape(-1, 3)
     limits = np.float32(config.edge_jump), np.float32(slope_limit(view.K[0, 0], config))
-    near, around = (_steps(reach) for reach in (FRINGE, 2 * FRINGE))
-    near = near[np.abs(near).max(axis=1) == FRINGE]
-    inside = np.full(view.depth.shape, -1)
-    behind = np.zeros_like(inside)
-    behind.flat[pixels] = -1
-    for_each(_find_nearest, SHARES, (inverse_depth, *limits, pixels, near, True, inside, behind))
-    fringe = pixels[behind.flat[pixels] >= 0]
-    for_each(_find_nearest, SHARES, (inverse_depth, *limits, fringe, around, False, behind, inside))
+    steps = _steps(FRINGE)
+    steps = steps[np.abs(steps).max(axis=1) == FRINGE]  # Next to an edge, pixels mix both sides.
+    inside, behind = np.full((2, *view.depth.shape), -1)
+    for_each(_find_nearest, SHARES, (view.depth, *limits, objects, steps, view.valid, 1.0, np.inf, behind))
+    fringe = objects[behind.flat[objects] >= 0]
+    body_mask = np.zeros(view.depth.shape, dtype=np.bool_)
+    body_mask.flat[objects] = behind.flat[objects] < 0
+    steps = _steps(2 * FRINGE)
+    for_each(_find_nearest, SHARES, (view.depth, *limits, fringe, steps, body_mask, -1.0, 1.0, inside))
     fringe = fringe[inside.flat[fringe] >= 0]
     places = fringe, behind.flat[fringe], inside.flat[fringe]
     own, background, body = (colour_shares(colours[place]) for place in places)
     to_background, to_body = (np.linalg.norm(own - other, axis=1) for other in (background, body))
-    wrong = to_background < np.minimum(to_body, 2.0 * PLAIN)
+    wrong = fringe[to_background < np.minimum(to_body, 2.0 * PLAIN)]
     corrected = colours.copy()
-    corrected[fringe[wrong]] = colours[inside.flat[fringe[wrong]]]
+    corrected[wrong] = colours[inside.flat[wrong]]
     return corrected
 
 
@@ -348,21 +345,21 @@ def _steps(reach: int) -> NDArray[np.intp]:
 
 @kernel
 def _find_nearest(share, data):  # type: ignore[no-untyped-def]
-    """Write the first pixel, some steps from every 16th of some pixels, that is behind it or on its surface.
+    """Write, for every 16th of some pixels, the nearest pixel (H, W) of a mask that lies so far behind it.
 
-    On its surface, only pixels count that show objects and are not on the fringe (H, W): those with −1.
+    The least and the most are in limits of one surface [1].
     """
-    inverse_depth, jump, slope, pixels, steps, farther, fringe, found = data
-    height, width = inverse_depth.shape
+    depth, jump, slope, pixels, steps, mask, least, most, found = data
+    height, width = depth.shape
     for i in range(share, len(pixels), SHARES):
         row, column = pixels[i] // width, pixels[i] % width
         for k in range(len(steps)):
             v, u = row + steps[k, 0], column + steps[k, 1]
-            if v < 0 or v >= height or u < 0 or u >= width or inverse_depth[v, u] == 0.0:
+            if v < 0 or v >= height or u < 0 or u >= width or not mask[v, u]:
                 continue
-            drop = inverse_depth[row, column] - inverse_depth[v, u]
             limit = jump + slope * np.float32(max(abs(steps[k, 0]), abs(steps[k, 1])))
-            if (farther and drop > limit) or (not farther and abs(drop) <= limit and fringe[v, u] < 0):
+            drop = np.float32(1.0) / depth[row, column] - np.float32(1.0) / depth[v, u]
+            if least * limit < drop <= most * limit:
                 found[row, column] = v * width + u
                 break
 
