@@ -32,6 +32,15 @@ def exploration(config=FEW_VIEWS, noise="none", robot=None, **options):
     return list(explore(set_up.camera, robot or set_up.robot, config=config, **options))
 
 
+def test_with_a_budget_the_robot_goes_on_and_the_last_step_knows_all_views(steps):
+    hurried = exploration(early_stop=False, budget=0.0)
+    assert hurried[-1].index == steps[-1].index
+    assert hurried[0].decision is not None
+    assert [s.index for s in hurried] == sorted({s.index for s in hurried})
+    taken = hurried[-1].visited
+    assert len(taken) == len(np.unique(taken.round(6), axis=0)) == len(steps)
+
+
 @pytest.fixture(scope="module")
 def steps():
     return exploration(early_stop=False)

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from itertools import combinations
+from time import perf_counter
 
 import numba
 import numpy as np
@@ -24,6 +26,7 @@ from caryatid.errors import InputError, PerceptionError
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry import transforms
+from caryatid.graph import SupportGraph
 from caryatid.io.bop import read_recording
 from caryatid.io.graph_json import graph_text
 from caryatid.scene import Scene
@@ -447,3 +450,37 @@ def test_a_first_view_of_the_floor_alone_does_not_hide_the_table():
     assert scene.views == 2
     assert scene.surface.point_world[2] == pytest.approx(TABLE, abs=0.005)
     assert sorted(s.supporter for s in scene.graph.supports) == ["o0", "o0"]
+
+
+def test_with_a_budget_a_graph_is_there_in_time_and_in_the_end_the_same():
+    views = [replace(v, labels=None) for v in simulated_views("clutter")[:3]]
+    whole, hurried, late = Scene(seed=1), Scene(seed=1), []
+    graphs = [graph_text(SupportGraph()), *(graph_text(whole.update(view)) for view in views)]
+    given, calls = [*views], 0
+    while given or hurried.open:
+        started = perf_counter()
+        graph = hurried.update(given.pop(0) if given else None, budget=0.05)
+        late.append(perf_counter() - started - 0.05)
+        calls += 1
+        assert graph_text(graph) == graphs[hurried.views]
+        assert len(given) + len(hurried.open) + hurried.views >= 3
+    assert graph_text(hurried.graph) == graphs[-1]
+    assert calls > 3
+    assert np.median(late) < 0.01
+    copied = pickle.loads(pickle.dumps(hurried))
+    assert graph_text(copied.graph) == graphs[-1]
+
+
+def test_a_report_waits_for_open_views_and_a_wrong_view_is_refused_late():
+    views = [replace(v, labels=None) for v in simulated_views("clutter")[:2]]
+    scene = Scene()
+    scene.update(views[0], budget=0.0)
+    assert scene.open == (views[0],)
+    assert not scene.copy().open
+    with pytest.raises(InputError, match="is not an object of the graph"):
+        scene.removed("o77")
+    assert scene.views == 1
+    scene.update(replace(views[1], T_world_camera=None), budget=0.0)
+    with pytest.raises(InputError, match="has no camera pose"):
+        scene.update()
+    assert (scene.open, scene.views) == ((), 1)

@@ -121,6 +121,23 @@ def test_a_session_over_http_is_the_session(client, views):
     assert left == {"views": 2, "reports": 0, "graph": graph_of(views[:2])}
 
 
+def test_a_view_with_a_budget_is_open_until_it_is_sent_again(client, views):
+    first = client.post("/sessions/a/views", json=body(views[0], budget=0.0))
+    assert (first.status_code, first.json()["open"], first.json()["graph"]["objects"]) == (202, True, [])
+    for answer in (
+        client.post("/sessions/a/views", json=body(views[1])),
+        client.post("/sessions/a/reports", json={"object": "o1"}),
+        client.delete("/sessions/a/views/last"),
+    ):
+        assert answer.status_code == 409
+        assert "view 0 is still being added; send that view again until it is" in answer.json()["detail"]
+    assert client.get("/sessions/a").json()["views"] == 0
+    done = client.post("/sessions/a/views", json=body(views[0]))
+    assert (done.status_code, done.json()["open"]) == (201, False)
+    assert done.json()["graph"] == graph_of(views[:1])
+    assert client.post("/sessions/a/views", json=body(views[1], budget=-1.0)).status_code == 422
+
+
 def camera_of(view, **changes):
     return {"K": view.K.tolist(), "T_world_camera": view.pose.tolist()} | changes
 

@@ -132,6 +132,8 @@ class Explorer:
             its removal depends on, and the loop stops when that is known.
         until: Probability [1], above 0.5, at which a support counts as known; with a goal, whether an object
             moves. The loop stops when all are known. None = 0.95 with a goal, otherwise never.
+        budget: Time that each `look` after the first takes [s], as for `Scene.update`; None = until the view
+            is in the model. With a budget, `plan` uses what is in the model by then.
 
     Attributes:
         scene: The scene model.
@@ -155,6 +157,7 @@ class Explorer:
         masks: Callable[[View], View] | None = None,
         goal: str | None = None,
         until: float | None = None,
+        budget: float | None = None,
     ) -> None:
         check_type("until", until, (float, int, NoneType), "give a probability, such as 0.95")
         if camera is not None:
@@ -173,6 +176,7 @@ class Explorer:
         self.robot = robot
         self.step: Step | None = None
         self._aside: list[tuple[Array, str]] = []
+        self._budget = budget
         self._camera = camera
         self.use_planner(planner)
 
@@ -191,17 +195,20 @@ class Explorer:
             given: A view, or a cloud with z up, to use instead of the camera.
 
         Returns:
-            The new step, without candidates and decision.
+            The new step, without candidates and decision; with a budget, the newest one there is.
 
         Raises:
             NoSurfaceError: No support surface is known or visible. `scene` keeps a view that has a pose.
             CaryatidError: The view cannot be used, or neither a view nor a camera is given.
         """
-        *_, step = self.looks(given)
-        return step
+        for _ in self.looks(given):
+            pass
+        return self._newest()
 
     def looks(self, given: View | Cloud | None = None) -> Iterator[Step]:
         """Look, and yield the steps of the kept views, then the step of the new one.
+
+        With a budget, yield those of the views that are in the model by then; later ones yield the others.
 
         Args:
             given: As for `look`.
@@ -217,10 +224,24 @@ class Explorer:
         if self._masks is not None and isinstance(given, View):
             given = self._masks(given)
         watch.lap("capture")
-        for taken in self.scene.updates(given):
+        self._aside = []
+        budget = None if self.step is None else self._budget
+        for taken in self.scene.updates(given, budget=budget):
             self.step = self._step(taken, watch.laps["capture"], kept=taken is not given)
-            self._aside = []
             yield self.step
+
+    def finish(self) -> Step:
+        """Wait until all views are in the model, which differs from `look` with a budget only.
+
+        Returns:
+            The newest step, without candidates and decision if there is a new one.
+
+        Raises:
+            CaryatidError: As for `look`.
+        """
+        for taken in self.scene.updates():
+            self.step = self._step(taken, 0.0, kept=True)
+        return self._newest()
 
     def _step(self, source: View | Cloud, captured: float, *, kept: bool) -> Step:
         """The step of the newest view of the scene, with its capture time [s]."""
@@ -285,9 +306,20 @@ class Explorer:
     def reason_to_stop(self) -> str | None:
         """After `plan`, return why another view may not be worth its path, or None.
 
+        A reason holds for the model of all views: those that are open are awaited, and the next one planned
+        again.
+
         Raises:
             PlanningError: No view was taken yet.
         """
+        reason = self._reason_to_stop()
+        if reason is not None and self.scene.open:
+            self.finish()
+            self.plan()
+            reason = self._reason_to_stop()
+        return reason
+
+    def _reason_to_stop(self) -> str | None:
         step = self._newest()
         if step.decision is None or step.candidates is None:
             return step.stop
@@ -379,7 +411,9 @@ class Explorer:
 
     def _state(self, candidates: Candidates) -> PlanningState:
         step = self._newest()
-        return planning_state(self.scene, step.sphere, step.visited, candidates, self.goal)
+        poses = [v.pose for v in self.scene.open if isinstance(v, View) and v.T_world_camera is not None]
+        visited = np.concatenate([step.visited, *(step.sphere.direction_of(T)[None] for T in poses)])
+        return planning_state(self.scene, step.sphere, visited, candidates, self.goal)
 
     def _moving(self) -> Robot:
         if self.robot is None:
@@ -403,6 +437,7 @@ def explore(
     masks: Callable[[View], View] | None = None,
     goal: str | None = None,
     until: float | None = None,
+    budget: float | None = None,
     early_stop: bool = True,
 ) -> Iterator[Step]:
     """Explore until no view is worth its path, or `max_views` is reached.
@@ -417,6 +452,7 @@ def explore(
         masks: Source of masks, or None to use those of the views.
         goal: As for `Explorer`.
         until: As for `Explorer`.
+        budget: As for `Explorer`.
         early_stop: Whether to stop before `max_views`, by `config.active.stop` and `until`.
 
     Yields:
@@ -426,20 +462,26 @@ def explore(
         CaryatidError: A view cannot be used, or the planner is unknown.
     """
     known: dict[str, Any] = {"config": config, "segmentation": segmentation, "seed": seed, "masks": masks}
-    explorer = Explorer(camera, robot, planner=planner, goal=goal, until=until, **known)
+    explorer = Explorer(camera, robot, planner=planner, goal=goal, until=until, budget=budget, **known)
+    shown = 0
     while True:
         step = explorer.look()
-        reason = used_up(step.index + 1, explorer.scene.config.active)
+        reason = used_up(step.index + 1 + len(explorer.scene.open), explorer.scene.config.active)
         if reason is None:
             step = explorer.plan()
             reason = explorer.reason_to_stop() if early_stop and step.stop is None else None
-        step = replace(step, removal=explorer.predict().removal)
+        step = explorer.predict()
         if reason is not None:
             step = replace(step, candidates=None, decision=None, stop=reason)
         if step.decision is not None:
-            yield step
+            if step.index >= shown:  # else the model has no further view yet
+                shown = step.index + 1
+                yield step
             step = explorer.go()
         if step.stop is not None:
+            if explorer.scene.open:
+                explorer.finish()
+                step = replace(explorer.predict(), candidates=None, decision=None, stop=step.stop)
             step = replace(step, reasons=explorer.scene.reasons())
             lost = goal is not None and all(o.id != goal for o in step.graph.objects)
             yield replace(step, stop=f"{step.stop}; {goal} was not found") if lost else step

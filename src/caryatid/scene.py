@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, wait
 from dataclasses import replace
 from time import perf_counter
 from types import NoneType
@@ -32,7 +33,7 @@ from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
 from caryatid.objects.reasons import Reasons
 from caryatid.runtime import Pictured, call
-from caryatid.runtime.parallel import one_blas_thread
+from caryatid.runtime.parallel import in_background, one_blas_thread
 from caryatid.segmentation.diagnosis import (
     check_camera,
     check_depth,
@@ -89,6 +90,7 @@ class Scene(Pictured):
         T_world_cameras: Poses (4, 4) of all views so far, each as registered when the view was new.
         views: Number of views in the model.
         waiting: Views kept until a later one shows the support surface.
+        open: Views and clouds that are still to be added, after an `update` with a budget.
         changed: Whether the newest view changed the graph.
         identified: Whether the labels given with the newest view are those of the objects in all views.
         timings: Time of each stage of the newest update [s].
@@ -124,6 +126,8 @@ class Scene(Pictured):
         self.T_world_cameras: tuple[Array, ...] = ()
         self.views = 0
         self.waiting: tuple[View, ...] = ()
+        self.open: tuple[View | Cloud, ...] = ()
+        self._work: tuple[Scene, Iterator[View | Cloud], Future[View | Cloud | None]] | None = None
         self._bare: tuple[View | Cloud, ...] = ()
         self.changed = False
         self.identified = False
@@ -227,7 +231,7 @@ class Scene(Pictured):
         return call("viewer", self)
 
     def copy(self) -> Scene:
-        """Return an independent copy.
+        """Return an independent copy, without the views in `open`.
 
         Both give the same graphs for the same further views. Data that no update changes in place is shared,
         so a copy costs almost nothing.
@@ -237,6 +241,10 @@ class Scene(Pictured):
         other._registration = None if self._registration is None else self._registration.copy()
         other._detector = self._detector.copy()
         return other
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state to store, without the views in `open`."""
+        return vars(self) | {"open": (), "_work": None}
 
     def removed(self, object_id: str) -> SupportGraph:
         """Report that an object was removed; the model deletes it, and its space becomes unknown.
@@ -250,6 +258,7 @@ class Scene(Pictured):
         Raises:
             InputError: The object is unknown, or it is the support surface.
         """
+        self.update()
         self._forget(self._object(object_id))
         self._reported("removed", object_id)
         return self.graph
@@ -267,6 +276,7 @@ class Scene(Pictured):
         Raises:
             InputError: The object is unknown, it is the support surface, or T is not a rigid transform.
         """
+        self.update()
         self._forget(self._object(object_id), transforms.as_rigid(T, "T"))
         self._reported("moved", object_id)
         return self.graph
@@ -284,6 +294,7 @@ class Scene(Pictured):
         Raises:
             InputError: The scene has no views, the shape is not in metres, or the label is not free.
         """
+        self.update()
         if self.voxels is None:
             raise InputError("scene", "has no views", "add a view first")
         check_type("shape", shape, Shape, "give a Box, a Cylinder, a Sphere or a Solid")
@@ -361,35 +372,75 @@ class Scene(Pictured):
             self._shown = (*self._shown[:-1], self._shown[-1] | {object_id})
         self._set_graph(newest)
 
-    def update(self, source: View | Cloud) -> SupportGraph:
+    def update(self, source: View | Cloud | None = None, *, budget: float | None = None) -> SupportGraph:
         """Add one view, or one cloud with z up, and return the fused graph.
 
         A view with a pose but without a support surface is kept, with a warning, until a view shows one. Kept
         views are then added first.
 
+        Args:
+            source: The view or cloud; None goes on with those in `open`.
+            budget: Time after which this returns [s]; None = all views are added first. The work goes on in
+                the background, and the next call takes over what is done by then: the graph is always that
+                of whole views, and after enough calls the same as without a budget.
+
         Raises:
-            InputError: Required labels are missing, or a later view has no pose.
+            InputError: Required labels are missing, a later view has no pose, or the budget is negative.
             WrongViewError: The camera or its pose cannot be correct; the scene does not change.
             PerceptionError: The view has no readings; or no support surface, and no pose.
         """
         kept = len(self.waiting)
         try:
-            for _ in self.updates(source):
+            for _ in self.updates(source, budget=budget):
                 pass
         except NoSurfaceError as error:
             if len(self.waiting) == kept:
                 raise
             log.warning(KEPT, error)
+            if budget is None and self.open:
+                self.update()
         return self.graph
 
-    def updates(self, source: View | Cloud) -> Iterator[View | Cloud]:
-        """Add one view or cloud, after the kept views; yield each when it is part of the model.
+    def updates(
+        self, source: View | Cloud | None = None, *, budget: float | None = None
+    ) -> Iterator[View | Cloud]:
+        """Add views as `update` does; yield each when it is part of the model.
 
         Raises:
             NoSurfaceError: The view shows no support surface; if it has a pose, it is kept.
             CaryatidError: As for `update`.
         """
-        check_type("source", source, (View, Cloud), "give a View or a Cloud")
+        end = perf_counter() + (np.inf if budget is None else budget)
+        if budget is not None and not budget >= 0.0:
+            raise InputError("budget", f"{budget} is not a time", "give seconds, such as 0.2")
+        if source is not None:
+            check_type("source", source, (View, Cloud), "give a View or a Cloud")
+            if budget is None and not self.open:
+                yield from self._add(source)
+                return
+            self.open = (*self.open, source)
+        while self.open:
+            if self._work is None:
+                ahead = self.copy()
+                views = ahead._add(self.open[0])
+                self._work = ahead, views, in_background(next, views, None)
+            ahead, views, job = self._work
+            if not wait([job], None if budget is None else max(end - perf_counter(), 0.0)).done:
+                return
+            # The next view, if any, goes on changing the objects of `ahead`.
+            vars(self).update(vars(ahead.copy()) | {"open": self.open, "_work": None})
+            done = None
+            try:
+                done = job.result()
+            finally:
+                if done is None:
+                    self.open = self.open[1:]
+            if done is not None:
+                self._work = ahead, views, in_background(next, views, None)
+                yield done
+
+    def _add(self, source: View | Cloud) -> Iterator[View | Cloud]:
+        """Add a view or cloud, after the kept views; yield each when it is part of the model."""
         if isinstance(source, View):
             check_camera(source, self.config.cloud.max_coordinate)
             if not self.views and not self.waiting:

@@ -91,6 +91,9 @@ class NewView(Document):
     """Grey PNG, or .npy (H, W) of integers: the object of each pixel, 0 = no object."""
     number: int | None = Field(None, ge=0)
     """Number of the view, from 0; makes retries safe: the last view is not added twice."""
+    budget: float | None = Field(None, ge=0.0)
+    """Time [s] after which to answer with status 202 that the view is `open`: it is still being added, and
+    has to be sent again; null = wait."""
 
 
 class NewReport(Document):
@@ -238,13 +241,15 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         return describe_session(given.name)
 
     @app.post("/sessions/{name}/views", status_code=201)
-    def add_view(name: Name, given: NewView) -> dict[str, Any]:
-        """Add a view; once this returns, the view is safe on disk."""
+    def add_view(name: Name, given: NewView, response: Response) -> dict[str, Any]:
+        """Add a view; once this returns 201, the view is safe on disk."""
         pool.check_room()
         camera = replace(given.camera, name="view" if given.number is None else f"view {given.number + 1}")
         images = {"depth": given.depth, "rgb": given.rgb, "labels": given.labels}
         known = {key: content for key, content in images.items() if content is not None}
-        return pool.session(name).add(Capture(known, camera), given.number).to_json()
+        added = pool.session(name).add(Capture(known, camera), given.number, budget=given.budget)
+        response.status_code = 202 if added.open else 201
+        return added.to_json()
 
     @app.post("/sessions/{name}/reports", status_code=201)
     def report_change(name: Name, given: NewReport) -> dict[str, Any]:

@@ -40,7 +40,7 @@ class Exploration:
         planning_scene: Shows the graph, and an object that was lifted, to a motion planner.
 
     Attributes:
-        scene: The newest scene; it is replaced, and never changes, so that other threads may read it.
+        scene: The newest scene; it is replaced, and changes only to take over views in the background.
         graph: Its graph as a message.
         max_views: Default maximum number of views of a goal.
 
@@ -92,6 +92,7 @@ class Exploration:
         explorer = Explorer(
             robot=self._robot, planner=self._settings.planner, config=self._config,
             seed=self._settings.seed, goal=goal.goal or None, until=goal.until or None,
+            budget=self._settings.budget or None,
         )  # fmt: skip
         if not goal.restart:
             explorer.step, self._explorer = self._explorer.step, explorer
@@ -131,7 +132,8 @@ class Exploration:
             frames = {self._settings.world_frame: np.eye(4), depth.header.frame_id: T_world_camera}
             view = messages.with_masks(view, others["masks"], frames)
         view = view if self._masks is None else self._masks(view)
-        explorer, scene, step, failure = self._explorer, self.scene.copy(), self._explorer.step, None
+        explorer, step, failure = self._explorer, self._explorer.step, None
+        scene = self.scene if self.scene.open else self.scene.copy()
         explorer.scene, self._robot.scene, self._robot.T_world_camera = scene, scene, T_world_camera
         try:
             try:
@@ -151,7 +153,14 @@ class Exploration:
             raise failure
         self.header.stamp = depth.header.stamp
         self.publish()
-        log.info("view %s added: %s", view.name, scene)
+        log.info("view %s added: %s%s", view.name, scene, f", {len(scene.open)} open" if scene.open else "")
+        return self.graph
+
+    def finish(self) -> Any:
+        """Wait for views that are still being added; the graph is published and returned."""
+        if self.scene.open:
+            self._explorer.finish()
+            self.publish()
         return self.graph
 
     def publish(self, lifted: SceneObject | None = None) -> None:
@@ -191,7 +200,7 @@ class Exploration:
 
     def order(self, request: Any, response: Any) -> None:
         """Plan a removal order, and fill in an Order response; another thread may change the scene."""
-        scene = self._known()
+        scene = self._known().copy()
         found = plan_order(
             scene.graph, scene.config, goal=request.goal or None, hands=request.hands or 1,
             steps=request.steps or None, seed=scene.seed, threads=cores(), voxels=scene.voxels,

@@ -111,6 +111,7 @@ class Goal:
                 decision, stop = self._do("planning the next view", exploration.plan, refusal)
                 refusal = None if stop is not None else self._go(decision)
             since = self._now()
+        result.graph = self._do("adding the last views", exploration.finish)
         unknown = r.goal and all(o.id != r.goal for o in result.graph.objects)
         return f"{stop}; {r.goal} was not found" if unknown else stop
 

@@ -45,6 +45,9 @@ class Settings:
     gripper_links: str = _given("", "links that touch what is `removed`, the first holds it; empty = none")
     session: str = _given("", "folder that keeps the scene over a restart; empty = none")
     seed: int = _given(0, "of every random choice", high=2**63 - 1)
+    budget: float = _given(
+        0.0, "time for each view after the first, before the next one is planned [s]; 0 = what it takes", 0.0
+    )
     slop: float = _given(0.02, "maximum time between the images of a view [s]", 0.0, 1.0)
     image_timeout: float = _given(5.0, "maximum wait for images and their transform [s]", 0.1)
     move_timeout: float = _given(120.0, "maximum wait until the camera is at the next view [s]", 0.1)
@@ -75,6 +78,9 @@ def check_parameters(settings: Settings) -> None:
     if colon and kind not in (*MASKS, "onnx"):
         remedy = "give onnx:FILE, labels:TOPIC or boxes:TOPIC"
         raise InputError("parameter masks", f"has the kind '{kind}'", remedy)
+    if settings.budget and settings.session:
+        reason = "is given with session, which keeps each view before the next one"
+        raise InputError("parameter budget", reason, "omit one of them")
     if not settings.depth_topic:
         raise InputError("parameter depth_topic", "is empty", "give the topic of depth images")
     names = [topic for topic, _ in settings.topics.values()]

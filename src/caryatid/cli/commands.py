@@ -70,6 +70,8 @@ class Explore(RunCommand, options.ExploringCommand, work="run:explore_scene"):
     """Object to remove: explore only what matters for it, and stop when it is clear what else would move."""
     until: Annotated[float | None, options.shown("P", "0.95 with --goal, else never")] = None
     """Stop when every support (with --goal, every effect of the removal) is known with this probability."""
+    budget: Annotated[options.Seconds | None, options.shown("SECONDS", "as long as a view takes")] = None
+    """Time for each view after the first; the robot then goes on while the view is being added."""
     view: options.Flag = False
     """Show the exploration in the browser; Ctrl-C closes the page."""
 

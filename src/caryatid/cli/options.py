@@ -102,6 +102,7 @@ def _parse_optional(info: PrimitiveTypeInfo) -> Any:
 Flag = Annotated[bool, shown()]
 Count = Annotated[int, number(int, "N", "an integer of at least 1", 1)]
 Natural = Annotated[int, number(int, "N", "an integer of at least 0", 0)]
+Seconds = Annotated[float, number(float, "SECONDS", "a time of at least 0", 0.0)]
 Probability = Annotated[float, number(float, "P", "a probability from 0 to 1", 0.0, 1.0)]
 OutPath = Annotated[Path, tyro.conf.arg(metavar="RUN")]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]

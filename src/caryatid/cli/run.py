@@ -55,7 +55,7 @@ def explore_scene(command: Explore) -> None:
             planner, camera = planner_for(command.chosen_planner, source.camera, truth, config, **looking)
             steps = explore(
                 camera, source.robot, planner=planner, config=config, masks=masks, goal=command.goal,
-                until=command.until, early_stop=not command.no_early_stop, **looking,
+                until=command.until, budget=command.budget, early_stop=not command.no_early_stop, **looking,
             )  # fmt: skip
             last = _record(command, writer, name, steps, truth, page)
         _finish(command, writer, name, last, command.goal)
@@ -263,8 +263,8 @@ def _conditions(command: Explore | Extract | Clear) -> str:
 def _about(command: Explore | Extract | Clear) -> dict[str, Any]:
     """Entries of run.json about the command."""
     names = (
-        "robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands", "reach",
-        "keyframe",
+        "robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "budget", "hands",
+        "reach", "keyframe",
     )  # fmt: skip
     known = {field.name: getattr(command, field.name) for field in fields(command)}
     options = {name: known[name] for name in names if name in known}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache, partial, wraps
 from pathlib import Path
@@ -170,6 +170,23 @@ def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
     for share in shares:
         share.result()
     return results
+
+
+def in_background(task: Callable[P, Result], *args: P.args, **kwargs: P.kwargs) -> Future[Result]:
+    """Begin a task in a thread of its own, after those begun before, with the caller's number of threads."""
+    threads = numba.get_num_threads()
+
+    def run() -> Result:
+        numba.set_num_threads(threads)
+        return task(*args, **kwargs)
+
+    return _background(os.getpid()).submit(run)
+
+
+@cache
+def _background(process: int) -> ThreadPoolExecutor:
+    """The thread of a process for what nobody waits for."""
+    return ThreadPoolExecutor(1, thread_name_prefix="caryatid-background")
 
 
 @cache

@@ -154,6 +154,7 @@ class Added:
         T_world_camera: Registered camera pose (4, 4), or None while the view waits.
         warnings: What may be wrong with the view, or why it waits; one sentence each.
         changes: Changes of objects since the previous view, seen or reported.
+        open: Whether the view is still being added; the rest is then that of the views before it.
     """
 
     number: int
@@ -162,11 +163,12 @@ class Added:
     T_world_camera: Array | None = None
     warnings: tuple[str, ...] = ()
     changes: tuple[Change, ...] = ()
+    open: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer of `caryatid session add` and of the service."""
         pose = None if self.T_world_camera is None else self.T_world_camera.tolist()
-        document = {"view": self.number, "changed": self.changed, "T_world_camera": pose}
+        document = {"view": self.number, "open": self.open, "changed": self.changed, "T_world_camera": pose}
         known = {"warnings": list(self.warnings), "changes": [asdict(change) for change in self.changes]}
         return document | known | {"graph": graph_to_json(self.graph)}
 

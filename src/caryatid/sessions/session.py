@@ -16,6 +16,7 @@ import logging
 import pickle
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, wait
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -46,6 +47,7 @@ from caryatid.robots import HUMANOID, Robot, Surroundings, find_robot, view_sphe
 from caryatid.robots.floor import STEP, FloorGrid
 from caryatid.robots.protocol import straight_lengths
 from caryatid.runtime import fingerprint
+from caryatid.runtime.parallel import in_background
 from caryatid.scene import KEPT, Scene
 from caryatid.segmentation.diagnosis import describe_camera
 from caryatid.sensing.view_sphere import ViewSphere
@@ -150,6 +152,7 @@ class Session:
 
     def __init__(self, path: Path, log: Log) -> None:
         self.path = path
+        self._open: tuple[str, Future[tuple[Scene, list[str]]]] | None = None
         self._log = log
         with ExitStack() as failure:
             failure.callback(log.close)
@@ -275,16 +278,18 @@ class Session:
         """The fused support graph."""
         return self.scene.graph
 
-    def add(self, view: View | Capture, number: int | None = None) -> Added:
-        """Add a view; once this returns, the view is on disk.
+    def add(self, view: View | Capture, number: int | None = None, *, budget: float | None = None) -> Added:
+        """Add a view; once this returns, the view is on disk, unless the answer is `open`.
 
         Args:
             view: A view, decoded or not. Only the first view may lack a pose.
             number: Number of the view, from 0; None = the next one. The last view is not added twice, so a
                 client that missed the answer can send it again.
+            budget: Time after which this returns [s]; None = the view is in the model first. The work goes
+                on in the background, and the view has to be given again to be added.
 
         Raises:
-            SessionConflictError: The view would get another number.
+            SessionConflictError: The view would get another number, or another one is open.
             InputError: The view cannot be used; the session does not change.
             PerceptionError: It has no readings; the session does not change.
         """
@@ -299,12 +304,32 @@ class Session:
                 raise SessionConflictError(view.name, reason)
             return self._added()
         self._check_alike(view)
-        scene = self.scene.copy()
-        with _collected_warnings() as warnings:
-            graph_text(scene.update(view))  # reject a view whose graph cannot be written
+        if self._open is not None and self._open[0] != event.digest:
+            self._check_not_open()
+        if self._open is None and budget is None:
+            scene, warnings = self._updated(view)
+        else:
+            job = in_background(self._updated, view) if self._open is None else self._open[1]
+            self._open = event.digest, job
+            if not wait([job], budget).done:
+                return replace(self._added(), number=self.views, open=True)
+            self._open = None
+            scene, warnings = job.result()
         self._add(view, event, content, scene)
         self._warnings = warnings
         return self._added()
+
+    def _updated(self, view: View) -> tuple[Scene, list[str]]:
+        """The scene with a view whose graph can be written, and the warnings."""
+        scene = self.scene.copy()
+        with _collected_warnings() as warnings:
+            graph_text(scene.update(view))
+        return scene, warnings
+
+    def _check_not_open(self) -> None:
+        if self._open is not None:
+            reason = f"view {self.views} is still being added"
+            raise SessionConflictError(self.path, reason, "send that view again until it is")
 
     def keep(self, view: View, scene: Scene) -> None:
         """Add a view with which a copy of the scene was updated; once this returns, the view is on disk.
@@ -347,10 +372,11 @@ class Session:
             The graph without the object, or with it at its new pose.
 
         Raises:
-            SessionConflictError: The report would get another number.
+            SessionConflictError: The report would get another number, or a view is open.
             InputError: The object is unknown, or T is not a rigid transform; the session does not change.
         """
         self._check_writable()
+        self._check_not_open()
         event = Event("report", object_id, T=None if T is None else as_rigid(T, "T"))
         if number is not None and number != self.reports:
             if not 0 <= number == self.reports - 1 or _told(self._events[-1]) != _told(event):
@@ -447,6 +473,7 @@ class Session:
             InputError: The session has no views, or an earlier one is broken; the session does not change.
         """
         self._check_writable()
+        self._check_not_open()
         if not self._events:
             raise SessionConflictError(self.path, "has nothing to undo", "add a view first")
         left = self._events[:-1]
