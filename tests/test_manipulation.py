@@ -457,7 +457,7 @@ class TestCommands:
         assert len(tried) > 1
         assert last.stop.endswith("lifts in a row found no object in place")
 
-    @pytest.mark.parametrize(("seen", "taken"), [(0.95, []), (0.0, [("o2", "can"), ("o1", "crate")])])
+    @pytest.mark.parametrize(("seen", "taken"), [(0.99, []), (0.0, [("o2", "can"), ("o1", "crate")])])
     def test_a_gripper_waits_until_its_path_is_seen(self, seen, taken, scene_file, tmp_path, capsys):
         """Above the table there is nothing to read a depth from, so that space stays unknown."""
         command = ["clear", scene_file, "--gripper", "suction", "--out", tmp_path / "run", "--json"]
@@ -466,7 +466,7 @@ class TestCommands:
         document, run = json.loads(capsys.readouterr().out), read_run(tmp_path / "run")
         assert [(step["object"], step["body"]) for step in document["steps"]] == taken
         assert all(step["ok"] and step["disturbed"] == [] for step in document["steps"])
-        assert all(0.0 <= step["grasp"]["seen_free"] < 0.95 for step in document["steps"])
+        assert all(0.0 <= step["grasp"]["seen_free"] < 0.99 for step in document["steps"])
         assert (document["success"], document["views"]) == (bool(taken), len(run.views))
         assert ("was not seen empty" if not taken else "o1 is removed") in document["stop"]
         assert {o.id for o in run.graph.objects} == {"o0", "o1", "o2"} - {i for i, _ in taken}

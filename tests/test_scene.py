@@ -25,10 +25,12 @@ from caryatid.config import CloudConfig, Config, FusionConfig, SensorConfig
 from caryatid.errors import InputError, PerceptionError
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.fitting.primitives import fit
 from caryatid.geometry import transforms
 from caryatid.graph import SupportGraph
 from caryatid.io.bop import read_recording
 from caryatid.io.graph_json import graph_text
+from caryatid.objects import models
 from caryatid.scene import Scene
 from caryatid.sensing.clouds import average_pixels
 from caryatid.sensing.views import SUPPORT_LABEL
@@ -484,3 +486,17 @@ def test_a_report_waits_for_open_views_and_a_wrong_view_is_refused_late():
     with pytest.raises(InputError, match="has no camera pose"):
         scene.update()
     assert (scene.open, scene.views) == ((), 1)
+
+
+def test_what_a_view_explains_already_is_not_fitted_again(monkeypatch):
+    """More of the same readings matter less and less: from four views to five, noise falls by a tenth."""
+    view, counts, scene = simulated_views("clutter", noise="carmine")[0], [], Scene()
+    monkeypatch.setattr(
+        models, "fit", lambda *args, **known: counts.append(len(known)) or fit(*args, **known)
+    )
+    for _ in range(5):
+        before = len(counts)
+        scene.update(view)
+    objects = sum(o.role == "object" for o in scene.graph.objects)
+    assert before >= 4 * objects
+    assert len(counts) - before < objects / 2

@@ -704,6 +704,7 @@ class Scene(Pictured):
     def _carrying(self, observation: Observation) -> list[SupportSurface]:
         """The main surface, and those that carry something as far as is known."""
         points = observation.cloud.points_world[(observation.labels > 0) & (observation.labels <= MAX_LABEL)]
+        points = points[:: max(1, len(points) // 5_000)]  # some tell
         known = {SUPPORT_LABEL - o.label for o in self.graph.support_surfaces}
         numbers = {0, *known, *find_surface_below(self.surfaces, points).tolist()}
         return [self.surfaces[k] for k in sorted(numbers) if k < len(self.surfaces)]
@@ -724,6 +725,7 @@ class Scene(Pictured):
         self, observation: Observation, shown: set[int], voxels: VoxelMap, table: Array, given: bool
     ) -> Observation:
         """Fit the objects this view changed; split and merge automatic segments as the shapes suggest."""
+        shown = self._models.outdated(shown, voxels)
         self._models.fit_all(shown, voxels)
         if self.identified:
             self._models.form(shown, voxels, table)

@@ -97,9 +97,34 @@ def signed_distance(polygon: NDArray[np.float64], x: float, y: float) -> float:
         if squared > 0.0:
             share = ((x - from_x) * along_x + (y - from_y) * along_y) / squared
             share = min(max(share, 0.0), 1.0)
-        least = min(least, np.hypot(x - from_x - share * along_x, y - from_y - share * along_y))
+        away_x, away_y = x - from_x - share * along_x, y - from_y - share * along_y
+        least = min(least, away_x * away_x + away_y * away_y)
         inside = inside and _turn(polygon, i - 1, i, x, y) >= 0.0
-    return -least if inside else least
+    return -np.sqrt(least) if inside else np.sqrt(least)
+
+
+@kernel
+def signed_distances(polygon: NDArray[np.float64], places: NDArray[np.float64]) -> Array:
+    """Signed distance (N,) [m] of points (N, 2), or of the first two coordinates of (N, 3), to a polygon."""
+    distances = np.empty(len(places))
+    for k in range(len(places)):
+        distances[k] = signed_distance(polygon, places[k, 0], places[k, 1])
+    return distances
+
+
+@kernel
+def fill(polygon: NDArray[np.float64], squares: NDArray[np.bool_]) -> None:
+    """Set the squares (X, Y) whose numbers lie within a polygon (N, 2), but not on its border."""
+    for x in range(squares.shape[0]):
+        low, high = np.inf, -np.inf
+        for i in range(len(polygon)):
+            from_x, to_x = polygon[i - 1, 0], polygon[i, 0]
+            if min(from_x, to_x) <= x <= max(from_x, to_x):
+                share = (x - from_x) / (to_x - from_x) if to_x != from_x else 1.0
+                y = polygon[i - 1, 1] + share * (polygon[i, 1] - polygon[i - 1, 1])
+                low, high = min(low, y), max(high, y)
+        if polygon[:, 0].min() < x < polygon[:, 0].max():
+            squares[x, int(np.floor(low + 1e-9)) + 1 : int(np.ceil(high - 1e-9))] = True
 
 
 @kernel

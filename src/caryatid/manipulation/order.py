@@ -476,7 +476,8 @@ class _DrawnScene:
             spec.memory = spec.compile().narena + 8 * (48 * more) ** 2
         self._lifting, limits = Lifting(spec, names), self._config
         seen, seconds = self._lifting.start, self._lifting.longest(self._lifting.start, limits)
-        moved = np.ones(len(bodies), dtype=np.bool_)
+        # One alone can disturb nothing.
+        state, moved = seen, np.full(len(bodies), len(bodies) > 1)
         while moved.any():
             state = self._lifting.rest(seen, np.flatnonzero(self.unstable).tolist(), seconds, limits)
             moved = strayed(seen, state, limits.moved, limits.turned) & ~self.unstable

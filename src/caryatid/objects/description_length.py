@@ -51,14 +51,12 @@ class Evidence:
         return replace(self, points=self.points[kept], normals=self.normals[kept], rgb=rgb, segments=segments)
 
     def joined(self, other: Evidence) -> Evidence:
-        """Return the evidence of two objects together; noise and space are the same for both."""
+        """Return the evidence of two objects together, without segments; noise and space are the same."""
         points = np.concatenate([self.points, other.points])
         normals = np.concatenate([self.normals, other.normals])
         known = self.rgb is not None and other.rgb is not None
         rgb = np.concatenate([self.rgb, other.rgb]) if known else None
-        seen = self.segments is not None and other.segments is not None
-        segments = np.concatenate([self.segments, other.segments], axis=1) if seen else None
-        return replace(self, points=points, normals=normals, rgb=rgb, segments=segments)
+        return replace(self, points=points, normals=normals, rgb=rgb, segments=None)
 
     def shown(self, least: int) -> list[NDArray[np.bool_]]:
         """Points (N,) that a view shows as a segment of its own, beside others."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from caryatid.geometry.shapes import Cylinder, Primitives, Shape, Sphere
 from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import UP, Array
 from caryatid.graph import SceneObject
-from caryatid.segmentation.support_plane import SupportSurface, find_surface_below
+from caryatid.segmentation.support_plane import Mask, SupportSurface, find_surface_below
 from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 SPACING = 0.015
@@ -46,20 +47,40 @@ def complete(
         voxels: The voxel map.
         config: Tolerances.
     """
-    shapes = [o.shape for o in objects]
-    done = [_raise_upper_side(o, shapes[:k] + shapes[k + 1 :], voxels, config) for k, o in enumerate(objects)]
+    every, others = _Balls.of([o.shape for o in objects]), ~np.eye(len(objects), dtype=np.bool_)
+    done = [_raise_upper_side(o, every, others[k], voxels, config) for k, o in enumerate(objects)]
     lowest = [o.shape.surface(SPACING)[0][:, 2].min() for o in objects]
-    tops = [o.centre_world[2] + o.shape.support(UP[None])[0] for o in done]
+    tops = np.array([o.centre_world[2] + o.shape.support(UP[None])[0] for o in done])
+    below = find_surface_below(surfaces, np.array([o.centre_world for o in done]).reshape(-1, 3))
+    every = _Balls.of([o.shape for o in done])
     for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
-        others = [o.shape for n, o in enumerate(done) if n != k]
-        lower = [o.shape for o, top in zip(done, tops, strict=True) if top < tops[k]]
-        surface = surfaces[find_surface_below(surfaces, done[k].centre_world[None])[0]]
-        done[k] = _extend_downwards(done[k], others, lower, surface, voxels, config)
+        lower = tops < tops[k]
+        done[k] = _extend_downwards(done[k], every, others[k], lower, surfaces[below[k]], voxels, config)
+        every = every.changed(k, done[k].shape)
     return done
 
 
+class _Balls(NamedTuple):
+    """N shapes, and a ball around each: centres (N, 3) and radii (N,) [m]."""
+
+    shapes: list[Shape]
+    centres: Array
+    radii: Array
+
+    @classmethod
+    def of(cls, shapes: list[Shape]) -> _Balls:
+        arrays = Primitives.of(shapes)
+        return cls(shapes, arrays.centres, np.linalg.norm(arrays.half, axis=1))
+
+    def changed(self, k: int, shape: Shape) -> _Balls:
+        """Put another shape in the place of one."""
+        self.shapes[k], self.centres[k] = shape, shape.T_world_object[:3, 3]
+        self.radii[k] = np.linalg.norm(shape.extents) / 2.0
+        return self
+
+
 def _raise_upper_side(
-    candidate: SceneObject, others: Sequence[Shape], voxels: VoxelMap, config: CompletionConfig
+    candidate: SceneObject, every: _Balls, others: Mask, voxels: VoxelMap, config: CompletionConfig
 ) -> SceneObject:
     """Extend an object's unseen upper side to the shape above if that is likely; widen its uncertainty."""
     shape, known = candidate.shape, candidate.uncertainty
@@ -73,7 +94,7 @@ def _raise_upper_side(
     points, rim = _face(shape, axis, -sign)
     across = np.delete(shape.T_world_object[:3, :3], axis, axis=1)
     shown, most = float(shape.extents[axis]), float(voxels.config.extent[2])
-    room = _way_to_others(_inwards(points, across, config.overlap), up_world, most, others, config)
+    room = _way_to_others(_inwards(points, across, config.overlap), up_world, most, every, others, config)
     if room < LEAST or room >= most:
         return candidate
     if _free_before(_inwards(rim, across, voxels.config.size), up_world, room, voxels, config) < room:
@@ -100,8 +121,9 @@ def _variance(shown: float, room: float, put: float) -> float:
 
 def _extend_downwards(
     candidate: SceneObject,
-    others: Sequence[Shape],
-    lower: Sequence[Shape],
+    every: _Balls,
+    others: Mask,
+    lower: Mask,
     surface: SupportSurface,
     voxels: VoxelMap,
     config: CompletionConfig,
@@ -122,17 +144,17 @@ def _extend_downwards(
     length = float(surface.height(points).min()) / -float(down_world @ surface.normal_world)
     across = np.delete(shape.T_world_object[:3, :3], axis, axis=1)
     shown = float(shape.extents[axis])
-    if lower and shown < THIN:
+    if lower.any() and shown < THIN:
         # As deep as a fit must be at least, it may reach into what it lies on.
         top = _inwards(_face(shape, axis, -sign)[0], across, config.overlap)
-        room = _way_to_others(top, down_world, shown, lower, replace(config, overlap=0.0))
+        room = _way_to_others(top, down_world, shown, every, lower, replace(config, overlap=0.0))
         length = min(length, room - shown) if room < shown else length
     if length <= 0.0:
         return replace(candidate, shape=_lengthened(shape, axis, sign, length))
     reason = "is assumed to reach down to the table"
     # What lies beside the shape may overlap its walls by as much as what lies ahead may overlap the side.
     points = _inwards(points, across, config.overlap)
-    to_object = _way_to_others(points, down_world, length, others, config)
+    to_object = _way_to_others(points, down_world, length, every, others, config)
     if to_object < length:
         length, reason = to_object, "ends at the next object"
     # A voxel inside the walls, so that their noise does not count.
@@ -147,20 +169,20 @@ def _extend_downwards(
 
 
 def _way_to_others(
-    points: Array, outward: Array, limit: float, others: Sequence[Shape], config: CompletionConfig
+    points: Array, outward: Array, limit: float, every: _Balls, others: Mask, config: CompletionConfig
 ) -> float:
-    """How far [m] points (N, 3) can move before they meet another shape, by sphere tracing."""
-    shapes, middle = Primitives.of(others), points.mean(axis=0)
+    """How far [m] points (N, 3) can move before they meet one of some shapes (M,), by sphere tracing."""
+    middle = points.mean(axis=0)
     # A ball around a shape that is further than the limit from the one around the face limits no step.
-    to_centres = shapes.centres - middle
+    to_centres = every.centres - middle
     ahead = np.clip(to_centres @ outward, 0.0, limit)
     aside = np.linalg.norm(to_centres - ahead[:, None] * outward, axis=1)
     radius = np.linalg.norm(points - middle, axis=1).max() + limit
-    near = np.flatnonzero(aside < radius + np.linalg.norm(shapes.half, axis=1)).tolist()
+    near = np.flatnonzero(others & (aside < radius + every.radii)).tolist()
     length = 0.0
     while near and length < limit:
         moved = points + length * outward
-        gap = min(others[k].signed_distance(moved).min() for k in near) + config.overlap
+        gap = min(every.shapes[k].signed_distance(moved).min() for k in near) + config.overlap
         if gap < LEAST:
             return max(length - config.overlap, 0.0)
         length += gap

@@ -15,13 +15,14 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from caryatid.config import Config, SegmentationConfig
-from caryatid.fitting.primitives import Fit, FitFailure, fit
+from caryatid.fitting.primitives import Fit, FitFailure, fit, free_inside
 from caryatid.geometry import transforms
 from caryatid.geometry.points import last_in_voxels, most_central, rotate, transform
 from caryatid.geometry.shapes import Primitives, Shape
+from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, object_id
-from caryatid.objects.compounds import Compound
+from caryatid.objects.compounds import Compound, shape_costs
 from caryatid.objects.description_length import (
     Evidence,
     Explanation,
@@ -235,6 +236,7 @@ class ObjectModels:
         self.fits: dict[int, SceneObject] = {}
         self._config = config
         self._seed = seed
+        self._fitted: dict[int, tuple[int, int]] = {}
         self._solids: dict[int, SceneObject] = {}
         self._compounds: dict[int, Shape | Compound | None] = {}
         self._undivided: dict[int, int] = {}
@@ -384,6 +386,36 @@ class ObjectModels:
         self.points.bound(edges, config.cloud.views, config.cloud.depth)
         return {label for label in shown if label <= MAX_LABEL}
 
+    def outdated(self, labels: set[int], voxels: VoxelMap) -> set[int]:
+        """Find the objects among these whose shapes a new view may change.
+
+        A shape holds while it explains the newest points as well as true shapes do, on sides that earlier
+        points confirm, and no more of its inside is seen free; and until there are so many more points that
+        their noise matters less.
+        """
+        config, sigma = self._config, self._noise()
+        found = labels - self.fits.keys()
+        for label in sorted(labels - found):
+            o, cloud = self._solids.get(label, self.fits[label]), self.points.newest(label)
+            points, normals = cloud.points_world, cloud.normals_world
+            if isinstance(o.shape, Solid):
+                squares = o.shape.signed_distance(points) ** 2 / (2.0 * sigma**2)
+                costs = np.minimum(squares, config.explanation.outlier)
+            else:
+                costs = shape_costs(o.shape, points, normals, sigma, config.explanation)
+            facing = normals @ o.shape.T_world_object[:3, :3]
+            sides = np.count_nonzero(np.stack([-facing, facing], axis=2) > 0.7, axis=0).ravel()
+            new_mask = (sides >= max(config.fit.min_points, 0.02 * len(points))) & ~np.array(o.seen)
+            count, free = self._fitted.get(label, (0, 0))
+            if (
+                costs.mean() > config.explanation.usual
+                or new_mask.any()
+                or len(self.points.of(label)) >= GROWTH * count
+                or _count_free_inside(self.fits[label].shape, voxels) > free
+            ):
+                found.add(label)
+        return found
+
     def fit_newest(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
         """Fit objects to the newest view's points alone, and forget all other fits (`sg`).
 
@@ -408,7 +440,7 @@ class ObjectModels:
             cloud = self.points.of(label)
             if len(cloud) < GROWTH * self._undivided.get(label, 0):
                 continue
-            evidence, whole = self._explained(label, noise, voxels)
+            evidence, whole = self._explained(label, noise, voxels, sighted=True)
             rng = np.random.default_rng([self._seed, label])
             groups = split(evidence, whole, config=self._config, rng=rng)
             if groups is None:
@@ -506,7 +538,7 @@ class ObjectModels:
         """
         noise, names = self._noise(), tuple(map(object_id, labels))
         rng = np.random.default_rng([self._seed, *labels])
-        known = [self._explained(k, noise, voxels, compound=True) for k in labels]
+        known = [self._explained(k, noise, voxels, compound=True, sighted=True) for k in labels]
         if len(known) == 2:
             return explain_pair(names, known, frozenset(labels) in self._distinct, self._config, rng)
         evidence, explanation = known[0]
@@ -517,13 +549,22 @@ class ObjectModels:
         return explain_object(names[0], explanation, evidence, self._config, rng)
 
     def _explained(
-        self, label: int, noise: float, voxels: VoxelMap | None, *, compound: bool = False
+        self,
+        label: int,
+        noise: float,
+        voxels: VoxelMap | None,
+        *,
+        compound: bool = False,
+        sighted: bool = False,
     ) -> tuple[Evidence, Explanation]:
-        """Evidence of an object, and its best explanation: its fitted shape or, if asked, a compound."""
+        """Evidence of an object, and its best explanation: its fitted shape or, if asked, a compound.
+
+        If asked, the evidence has the segments of all views.
+        """
         config = self._config.explanation
         cloud = self.points.of(label, config.spacing)
         weight = config.spacing**2 / config.reading
-        shown = self._shown(label, cloud)
+        shown = self._shown(label, cloud) if sighted else None
         evidence = Evidence(cloud.points_world, cloud.normals_world, weight, noise, voxels, cloud.rgb, shown)
         shape = self.fits[label].shape
         explanation = best_explanation([shape], evidence, config)
@@ -581,6 +622,8 @@ class ObjectModels:
             self.fits.pop(label, None)
             self._compounds.pop(label, None)
             if isinstance(result, Fit):
+                free = 0 if voxels is None else _count_free_inside(result.shape, voxels)
+                self._fitted[label] = len(self.points.of(label)), free
                 self.fits[label] = SceneObject(
                     id=object_id(label),
                     label=label,
@@ -590,6 +633,11 @@ class ObjectModels:
                     seen=result.seen,
                     uncertainty=result.uncertainty,
                 )
+
+
+def _count_free_inside(shape: Shape, voxels: VoxelMap) -> int:
+    """Number of voxels seen free well inside a shape."""
+    return free_inside(shape, voxels, 1.2 * voxels.config.size)[1]
 
 
 def associate(

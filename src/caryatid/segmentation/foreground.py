@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence, Set
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from caryatid.config import Config
 from caryatid.geometry import transforms
+from caryatid.geometry.polygons import signed_distances
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import kernel
 from caryatid.segmentation.support_plane import Mask, SupportSurface
@@ -139,18 +139,16 @@ def find_furniture(
     highest, longest = high[2], (high - low)[:2].max(axis=0)
     some = slice(None, None, max(1, len(part) // ENOUGH))
     part, points_world = part[some], points_world[some]
-    sizes, places = np.maximum(np.bincount(part, minlength=count), 1), shapely.points(points_world[:, :2])
+    sizes = np.maximum(np.bincount(part, minlength=count), 1)
     lowest = np.array([surface.point_world[2] for surface in surfaces])[stands_on]
     furniture = np.zeros(count, dtype=np.bool_)
     for surface in surfaces:
-        outline = shapely.Polygon(surface.outline_world[:, :2])
-        shapely.prepare(outline)
-        away = shapely.distance(places, outline.exterior)
+        away = signed_distances(surface.outline_world, points_world)
         within = surface.region.grown(margin).holds(points_world)
         # Something on the surface may hide a corner of it.
-        border = within & ((away <= margin) | ~shapely.contains(outline, places))
+        border = within & (away >= -margin)
         close, along, under = (
-            np.bincount(part, which, count) / sizes for which in (away <= THIN, border, within)
+            np.bincount(part, which, count) / sizes for which in (np.abs(away) <= THIN, border, within)
         )
         room = surface.point_world[2] - lowest
         # What is higher than objects are is left out.

@@ -9,7 +9,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -90,10 +89,9 @@ class Region:
         corners = hull(np.argwhere(self.squares).astype(np.float64))
         if len(corners) < 3:
             return self
-        polygon = shapely.Polygon(corners)
-        shapely.prepare(polygon)
-        inside = shapely.contains_xy(polygon, *np.indices(self.squares.shape))
-        return replace(self, squares=self.squares | inside)
+        squares = self.squares.copy()
+        polygons.fill(corners, squares)
+        return replace(self, squares=squares)
 
     def trimmed(self) -> Region:
         """The same squares on the smallest grid that holds them."""
@@ -153,7 +151,9 @@ class SupportSurface:
         """
         own = self.region.grown(margin)
         arrays = map(np.ascontiguousarray, (points_world, self.normal_world, self.point_world))
-        return _over(*arrays, float(low), float(high), own.corner, own.squares, own.size)
+        over = np.zeros(len(points_world), dtype=np.bool_)
+        for_each(_over, SHARES, (*arrays, float(low), float(high), own.corner, own.squares, own.size, over))
+        return over
 
     def pixels_over(
         self, view: View, low: float, high: float, margin: float = np.inf, *, core: bool = False
@@ -168,12 +168,11 @@ class SupportSurface:
         own = self.core if core else self.region
         own = own if everywhere else own.grown(margin)
         grid = own.squares, own.corner, own.size
-        return _pixels_over(view.depth, x, y, T, self._plane, everywhere, *grid, low, high)
-
-    @property
-    def _plane(self) -> Array:
-        """Its plane n·p + d (4,)."""
-        return np.append(self.normal_world, -self.normal_world @ self.point_world)
+        over = np.zeros(view.depth.shape, dtype=np.bool_)
+        plane = np.append(self.normal_world, -self.normal_world @ self.point_world)
+        data = view.depth, x, y, T, plane, everywhere, *grid, float(low), float(high), over
+        for_each(_pixels_over, SHARES, data)
+        return over
 
     def continued(self, view: View, config: SurfaceConfig) -> SupportSurface:
         """Return the surface with the region that a view leaves open.
@@ -364,9 +363,9 @@ def find_surface_below(surfaces: Sequence[SupportSurface], points_world: Array) 
     least, below = np.full(len(points_world), np.inf), np.zeros(len(points_world), dtype=np.intp)
     for k, surface in enumerate(surfaces):
         height = surface.height(points_world)
-        outline = shapely.Polygon(surface.outline_world[:, :2]).buffer(BESIDE)
-        shapely.prepare(outline)
-        nearer = (height > -BESIDE) & (height < least) & shapely.contains_xy(outline, points_world[:, :2])
+        nearer = np.flatnonzero((height > -BESIDE) & (height < least))
+        away = polygons.signed_distances(surface.outline_world, points_world[nearer])
+        nearer = nearer[away < BESIDE]
         least[nearer], below[nearer] = height[nearer], k
     return below
 
@@ -419,7 +418,8 @@ def find_support_surfaces(
     for surface in known:
         height, wide = surface.height(points), surface.region.grown(config.gap)
         near = left & (np.abs(height) < config.search) & wide.holds(points)
-        plane = scene.largest_plane(_some(near, 1_000 if surfaces else 5_000), rng)
+        some = _some(near, 1_000 if surfaces else 5_000)
+        plane = scene.largest_plane(some, rng)
         same = None if plane is None else _surface(points, plane, config, surface)
         surfaces.append(surface if same is None else same.placed(surface.point_world))
         left &= ~near
@@ -588,14 +588,13 @@ def _held(places, corner, squares, size):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _over(points, normal, origin, low, high, corner, squares, size):  # type: ignore[no-untyped-def]
-    """See `SupportSurface.over`."""
-    over = np.zeros(len(points), np.bool_)
-    for k in range(len(points)):
+def _over(share, data):  # type: ignore[no-untyped-def]
+    """Write which points of a share are over a surface, see `SupportSurface.over`."""
+    points, normal, origin, low, high, corner, squares, size, over = data
+    for k in range(share * len(points) // SHARES, (share + 1) * len(points) // SHARES):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         height = (x - origin[0]) * normal[0] + (y - origin[1]) * normal[1] + (z - origin[2]) * normal[2]
         over[k] = low < height < high and _is_held(x, y, corner, squares, size)
-    return over
 
 
 @kernel
@@ -621,13 +620,14 @@ def _score_planes(share, data):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _pixels_over(depth, x, y, T, plane, everywhere, squares, corner, size, low, high):  # type: ignore[no-untyped-def]
-    over = np.zeros(depth.shape, np.bool_)
+def _pixels_over(share, data):  # type: ignore[no-untyped-def]
+    """Write which pixels of every 16th row are over a surface, see `SupportSurface.pixels_over`."""
+    depth, x, y, T, plane, everywhere, squares, corner, size, low, high, over = data
     a = plane[0] * T[0, 0] + plane[1] * T[1, 0] + plane[2] * T[2, 0]
     b = plane[0] * T[0, 1] + plane[1] * T[1, 1] + plane[2] * T[2, 1]
     c = plane[0] * T[0, 2] + plane[1] * T[1, 2] + plane[2] * T[2, 2]
     d = plane[0] * T[0, 3] + plane[1] * T[1, 3] + plane[2] * T[2, 3] + plane[3]
-    for row in range(len(y)):
+    for row in range(share, len(y), SHARES):
         for col in range(len(x)):
             z = float(depth[row, col])
             if z <= 0.0 or not low < (a * x[col] + b * y[row] + c) * z + d < high:
@@ -637,4 +637,3 @@ def _pixels_over(depth, x, y, T, plane, everywhere, squares, corner, size, low, 
             i, j = int(np.floor(u / size)) - corner[0], int(np.floor(v / size)) - corner[1]
             inside = 0 <= i < squares.shape[0] and 0 <= j < squares.shape[1]
             over[row, col] = everywhere or (inside and squares[i, j])
-    return over

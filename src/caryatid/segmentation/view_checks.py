@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import generate_binary_structure, maximum_filter, minimum_filter
 
 from caryatid.config import Config, SurfaceConfig
 from caryatid.errors import WrongViewError
@@ -42,15 +42,16 @@ def check_masks(view: View, eye_world: Array | None, surface: SupportSurface, co
     assert eye_world is not None
     distance = np.linalg.norm(eye_world - surface.point_world)
     enough = config.segmentation.min_area / (distance / view.K[0, 0]) ** 2
-    unread = np.bincount(view.labels[(view.depth <= 0.0) & (view.labels > 0)])
-    lost = []
-    for label in np.flatnonzero(unread > max(enough - config.fit.min_points, 0)):
-        # At the borders of masks, sensors often have no reading.
-        inner = binary_erosion(view.labels == label)
-        readings = np.count_nonzero(view.depth[inner])
-        if np.count_nonzero(inner) >= enough and readings < config.fit.min_points:
-            lost.append(label)
-    if names := ", ".join(map(str, lost)):
+    if np.count_nonzero((view.depth <= 0.0) & (view.labels > 0)) < enough - config.fit.min_points:
+        return
+    # At the borders of masks, sensors often have no reading.
+    cross = generate_binary_structure(2, 1)
+    least, most = (f(view.labels, footprint=cross) for f in (minimum_filter, maximum_filter))
+    inner = np.where(least == most, view.labels, 0)
+    pixels, readings = np.bincount(inner.ravel()), np.bincount(inner[view.depth > 0.0])
+    readings = np.pad(readings, (0, len(pixels) - len(readings)))
+    lost = np.flatnonzero((pixels >= enough) & (readings < config.fit.min_points))
+    if names := ", ".join(map(str, lost[lost > 0].tolist())):
         log.warning("%s: too few depth readings in mask %s; its object is missed", view.name, names)
 
 

@@ -120,7 +120,8 @@ class Lifting:
         """Lift an object of a state (N, 7) straight up, put it aside and observe the others.
 
         Some objects may be held in place meanwhile. If it need not go on to the end, it stops as soon as an
-        object is disturbed or all are at rest, and does not begin if there are no others.
+        object is disturbed or all are at rest, and does not begin if there are no others; and the object is
+        put aside as soon as the rest of its way is clear.
         """
         watched = state[:, 2] < ASIDE / 2.0
         watched[index] = False
@@ -135,18 +136,34 @@ class Lifting:
         film: list[Array] = []
         for speed, seconds in ((config.speed, lifted), (0.0, config.watch)):
             segments = max(1, int(np.ceil(seconds / 0.25)))  # a falling object is seen falling
-            for _ in range(segments):
+            for left in reversed(range(segments)):
                 film.append(self._after(data, speed, seconds / segments, index))
                 disturbed |= watched & strayed(state, film[-1], config.moved, config.turned)
                 at_rest = speed == 0.0 and _still(film[-2], film[-1])
                 if not to_the_end and (at_rest or disturbed.any()):
                     return Lift(disturbed, np.array(film))
+                way = speed * seconds * left / segments
+                if not to_the_end and way and self._is_clear(data, index, way):
+                    break
             if speed > 0.0:
                 # Out of the way, at rest.
                 place = np.array([0.0, 0.0, ASIDE + index])
                 data.qpos[self._qpos[index, :3]] = data.mocap_pos[self._hand[index]] = place
                 data.qvel[self._qvel[index]] = 0.0
         return Lift(disturbed, np.array(film))
+
+    def _is_clear(self, data: Any, index: int, way: float) -> bool:
+        """Whether an object touches nothing here and on its way up [m], in steps of a centimetre."""
+        height, touches = self._qpos[index, 2], False
+        here = float(data.qpos[height])
+        for rise in np.append(np.arange(0.0, way, 0.01), way):
+            data.qpos[height] = here + rise
+            mujoco.mj_kinematics(self.model, data)
+            mujoco.mj_collision(self.model, data)
+            touches = touches or bool(np.isin(data.contact.geom, self._geoms[index]).any())
+        data.qpos[height] = here
+        mujoco.mj_kinematics(self.model, data)
+        return not touches
 
     def _data(self, state: Array, grasped: Collection[int]) -> Any:
         """MuJoCo's data for a state; grasped and removed objects are held in place."""
