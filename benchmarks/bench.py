@@ -44,6 +44,7 @@ MEASUREMENTS: dict[str, Callable[[Effort], list[Row]]] = {
     "decision": speed.measure_decision,
     "map": speed.measure_map,
     "real": speed.measure_real,
+    "budget": speed.measure_budget,
     "start": speed.measure_start,
     **{f"growth.{axis}": partial(speed.measure_growth, axis) for axis in speed.AXES},
     "large": speed.measure_large,

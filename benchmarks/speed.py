@@ -11,6 +11,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from multiprocessing import get_context
@@ -24,10 +25,12 @@ from rows import PAUSE, Effort, Limit, Row, T, in_turns, median, timed, timed_ro
 
 from caryatid import Config, Scene, SupportGraph, View, next_best_view
 from caryatid.config import SegmentationMethod, SensorConfig
+from caryatid.errors import CaryatidError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import UP, Array
 from caryatid.io.bop import read_recording
+from caryatid.io.graph_json import graph_text
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.expected_visibility import SURFACE_SAMPLES
@@ -61,6 +64,8 @@ PITCH = 0.11
 SEGMENTATIONS: tuple[SegmentationMethod, ...] = ("auto", "labels")
 SEGMENTS = {"auto": "automatic segments", "labels": "labels given"}
 TARGETS = {"turn.auto": 0.5, "turn.labels": 0.5, "perceive.labels": 0.25}
+BUDGET = 0.2
+"""Budget of a call [s]."""
 OBJECTS, POINTS = 36, 30
 """Objects on the table; some are dropped until a decision has at most this many points of interest [1]."""
 AXES = {
@@ -534,6 +539,34 @@ def measure_real(effort: Effort) -> list[Row]:
         timed_row("perceive.real.slowest", f"the slowest, {slowest.name}", [seconds], target=2500.0),
         Row("growth.memory.real", "peak memory of ten views of that frame", peak, "MB", target=1024.0),
     ]
+
+
+def measure_budget(effort: Effort) -> list[Row]:
+    """Measure how long calls with a budget take, on views of a heap and on real frames."""
+    sources: list[tuple[SegmentationMethod, list[View]]] = []
+    heap = record(load_scene(HEAP), 4).views
+    for name in SEGMENTATIONS:
+        sources.append((name, [fresh(view, labels=name == "labels") for view in heap]))
+    folders = [f for f in sorted(effort.real.glob("*/")) if "-masks" not in f.name]
+    sources += [("auto", [read_recording(folder)[0]]) for folder in folders]
+    took, differing = list[float](), 0
+    for segmentation, views in sources:
+        whole, hurried = Scene(segmentation=segmentation), Scene(segmentation=segmentation)
+        for view in views:
+            with suppress(CaryatidError):
+                whole.update(view)
+        while views or hurried.open:
+            following, started = views.pop(0) if views else None, time.perf_counter()
+            with suppress(CaryatidError):
+                hurried.update(following, budget=BUDGET)
+            took.append(1e3 * (time.perf_counter() - started))
+        differing += graph_text(whole.graph) != graph_text(hurried.graph)
+    what = f"99 % of calls with a budget of {1e3 * BUDGET:g} ms return within"
+    note = f"{len(sources)} scenes and frames, of which {differing} end with another graph than without"
+    row = Row(
+        "perceive.budget", what, float(np.quantile(took, 0.99)), "ms", runs=len(took), target=1.2e3 * BUDGET
+    )
+    return [replace(row, note=note)]
 
 
 def _real_views(folders: Sequence[Path], views: int) -> dict[Path, float]:

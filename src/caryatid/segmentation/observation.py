@@ -155,11 +155,11 @@ def observe(
     if pose is None and (eye := cloud.viewpoint_world) is not None:
         # A single sensor looks at the middle of what it sees.
         pose = transforms.look_at(eye, eye + transforms.unit(cloud.points_world - eye).mean(axis=0))
-    notes: tuple[str, ...] = ()
+    notes, surfaces = tuple[str, ...](), tuple[SupportSurface, ...]()
     if given is not None:
-        given, notes = _without_others(whole, cloud, given, known, UP, config, rng, pose)
+        given, notes, surfaces = _without_others(whole, cloud, given, known, UP, config, rng, pose)
     try:
-        surfaces = find_surfaces(cloud, given, known, UP, config, rng, pose)
+        surfaces = surfaces or find_surfaces(cloud, given, known, UP, config, rng, pose)
     except NoSurfaceError as error:
         causes = name_causes(whole, config.surface.max_tilt) if isinstance(whole, View) else []
         tilted = f" or, if that plane is the table, {' or '.join(causes)}" if causes else ""
@@ -400,7 +400,7 @@ def level_transform(
     pose = np.eye(4)  # the source is in the frame of its camera
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     if given is not None:
-        given, _ = _without_others(source, cloud, given, (), None, config, rng, pose)
+        given, *_ = _without_others(source, cloud, given, (), None, config, rng, pose)
     surface = find_surfaces(cloud, given, (), None, config, rng, pose)[0]
     return transforms.level_world(surface.normal_world, surface.point_world)
 
@@ -414,21 +414,22 @@ def _without_others(
     config: Config,
     rng: np.random.Generator,
     T_world_camera: Array | None,
-) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+) -> tuple[NDArray[np.int32], tuple[str, ...], tuple[SupportSurface, ...]]:
     """Remove labels of no objects, as segmenters of whole images give them: of surfaces, and void.
 
     In a first view, a label is a surface's if no other points show one, or only a floor far below; or if it
     is larger than objects are.
 
     Returns:
-        Labels (N,), and what is to be said about them.
+        Labels (N,), what is to be said about them, and the surfaces of a first view if they were found with
+        these labels.
     """
-    surfaces, shown = list(known), False
+    surfaces, shown, found = list(known), False, tuple[SupportSurface, ...]()
     apart = copy.deepcopy(rng)  # The same view without that label gives the same scene.
     if not known:
         with suppress(NoSurfaceError):
-            found = find_surfaces(cloud, given, (), up, config, apart, T_world_camera)[0]
-            heights = found.height(cloud.points_world[given > 0])
+            found = find_surfaces(cloud, given, (), up, config, apart, T_world_camera)
+            heights = found[0].height(cloud.points_world[given > 0])
             high = int(np.count_nonzero(heights > config.segmentation.max_height))
             shown = high < config.surface.min_points
         with suppress(NoSurfaceError):
@@ -447,7 +448,9 @@ def _without_others(
     assert source.labels is not None
     if is_void(source, np.where(np.isin(source.labels, [*others.keys() - {VOID}]), 0, source.labels)):
         others[VOID] = f"label {VOID} is void, around the others, and no object"
-    return np.where(np.isin(given, [*others]), np.int32(0), given), tuple(others.values())
+    if not others:
+        return given, (), found
+    return np.where(np.isin(given, [*others]), np.int32(0), given), tuple(others.values()), ()
 
 
 def find_surfaces(
