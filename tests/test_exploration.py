@@ -34,9 +34,8 @@ def exploration(config=FEW_VIEWS, noise="none", robot=None, **options):
 
 def test_with_a_budget_the_robot_goes_on_and_the_last_step_knows_all_views(steps):
     hurried = exploration(early_stop=False, budget=0.0)
-    assert hurried[-1].index == steps[-1].index
+    assert [step.index for step in hurried] == [step.index for step in steps]
     assert hurried[0].decision is not None
-    assert [s.index for s in hurried] == sorted({s.index for s in hurried})
     taken = hurried[-1].visited
     assert len(taken) == len(np.unique(taken.round(6), axis=0)) == len(steps)
 

@@ -483,9 +483,19 @@ def test_a_report_waits_for_open_views_and_a_wrong_view_is_refused_late():
         scene.removed("o77")
     assert scene.views == 1
     scene.update(replace(views[1], T_world_camera=None), budget=0.0)
+    scene.update(views[1], budget=0.0)
     with pytest.raises(InputError, match="has no camera pose"):
         scene.update()
-    assert (scene.open, scene.views) == ((), 1)
+    assert (scene.open, scene.views) == ((), 2)
+    scene.update(replace(views[1], T_world_camera=None), budget=0.0)
+    object_id = scene.graph.objects[-1].id
+    assert all(o.id != object_id for o in scene.removed(object_id).objects)
+    for budget in (-1.0, np.nan, "soon"):
+        with pytest.raises(InputError, match="budget"):
+            scene.update(views[0], budget=budget)
+    assert (scene.open, scene.views) == ((), 2)
+    scene.update(views[0], budget=np.inf)
+    assert (scene.open, scene.views) == ((), 3)
 
 
 def test_what_a_view_explains_already_is_not_fitted_again(monkeypatch):

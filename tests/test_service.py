@@ -15,6 +15,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 from urllib.parse import urlsplit
 
@@ -121,7 +122,9 @@ def test_a_session_over_http_is_the_session(client, views):
     assert left == {"views": 2, "reports": 0, "graph": graph_of(views[:2])}
 
 
-def test_a_view_with_a_budget_is_open_until_it_is_sent_again(client, views):
+def test_a_view_with_a_budget_is_open_until_it_is_sent_again(client, views, monkeypatch):
+    update, gate = Scene.update, Event()
+    monkeypatch.setattr(Scene, "update", lambda scene, view: gate.wait(30.0) and update(scene, view))
     first = client.post("/sessions/a/views", json=body(views[0], budget=0.0))
     assert (first.status_code, first.json()["open"], first.json()["graph"]["objects"]) == (202, True, [])
     for answer in (
@@ -132,6 +135,7 @@ def test_a_view_with_a_budget_is_open_until_it_is_sent_again(client, views):
         assert answer.status_code == 409
         assert "view 0 is still being added; send that view again until it is" in answer.json()["detail"]
     assert client.get("/sessions/a").json()["views"] == 0
+    gate.set()
     done = client.post("/sessions/a/views", json=body(views[0]))
     assert (done.status_code, done.json()["open"]) == (201, False)
     assert done.json()["graph"] == graph_of(views[:1])

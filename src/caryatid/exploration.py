@@ -26,7 +26,7 @@ from caryatid.robots import Posture, Robot, Unreachable, view_sphere_of, way_to
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.protocol import straight_lengths
 from caryatid.runtime import Pictured
-from caryatid.runtime.parallel import one_blas_thread
+from caryatid.runtime.parallel import check_budget, one_blas_thread
 from caryatid.scene import Scene, Stopwatch
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Camera, Cloud, View
@@ -176,7 +176,7 @@ class Explorer:
         self.robot = robot
         self.step: Step | None = None
         self._aside: list[tuple[Array, str]] = []
-        self._budget = budget
+        self._budget = check_budget(budget)
         self._camera = camera
         self.use_planner(planner)
 
@@ -230,18 +230,20 @@ class Explorer:
             self.step = self._step(taken, watch.laps["capture"], kept=taken is not given)
             yield self.step
 
-    def finish(self) -> Step:
-        """Wait until all views are in the model, which differs from `look` with a budget only.
+    def finish(self) -> list[Step]:
+        """Wait until all views are in the model; with a budget, some may be open.
 
         Returns:
-            The newest step, without candidates and decision if there is a new one.
+            Their steps, without candidates and decision.
 
         Raises:
             CaryatidError: As for `look`.
         """
+        steps = list[Step]()
         for taken in self.scene.updates():
             self.step = self._step(taken, 0.0, kept=True)
-        return self._newest()
+            steps.append(self.step)
+        return steps
 
     def _step(self, source: View | Cloud, captured: float, *, kept: bool) -> Step:
         """The step of the newest view of the scene, with its capture time [s]."""
@@ -306,20 +308,9 @@ class Explorer:
     def reason_to_stop(self) -> str | None:
         """After `plan`, return why another view may not be worth its path, or None.
 
-        A reason holds for the model of all views: those that are open are awaited, and the next one planned
-        again.
-
         Raises:
             PlanningError: No view was taken yet.
         """
-        reason = self._reason_to_stop()
-        if reason is not None and self.scene.open:
-            self.finish()
-            self.plan()
-            reason = self._reason_to_stop()
-        return reason
-
-    def _reason_to_stop(self) -> str | None:
         step = self._newest()
         if step.decision is None or step.candidates is None:
             return step.stop
@@ -456,36 +447,46 @@ def explore(
         early_stop: Whether to stop before `max_views`, by `config.active.stop` and `until`.
 
     Yields:
-        A step after each view; the last one again, with `stop`, if the robot can go to no further view.
+        A step for each view, without a decision if a later view was in the model before the robot went on;
+        the last one again, with `stop`, if the robot can go to no further view.
 
     Raises:
         CaryatidError: A view cannot be used, or the planner is unknown.
     """
     known: dict[str, Any] = {"config": config, "segmentation": segmentation, "seed": seed, "masks": masks}
     explorer = Explorer(camera, robot, planner=planner, goal=goal, until=until, budget=budget, **known)
-    shown = 0
+    unshown = list[Step]()
     while True:
-        step = explorer.look()
-        reason = used_up(step.index + 1 + len(explorer.scene.open), explorer.scene.config.active)
-        if reason is None:
-            step = explorer.plan()
-            reason = explorer.reason_to_stop() if early_stop and step.stop is None else None
+        unshown += explorer.looks()
+        reason = _plan(explorer, early_stop)
+        if explorer.scene.open and (reason or explorer.predict().stop):
+            unshown += explorer.finish()
+            reason = _plan(explorer, early_stop)
         step = explorer.predict()
         if reason is not None:
             step = replace(step, candidates=None, decision=None, stop=reason)
+        yield from unshown[:-1]
         if step.decision is not None:
-            if step.index >= shown:  # else the model has no further view yet
-                shown = step.index + 1
+            if unshown:
                 yield step
             step = explorer.go()
+        unshown = []
         if step.stop is not None:
-            if explorer.scene.open:
-                explorer.finish()
-                step = replace(explorer.predict(), candidates=None, decision=None, stop=step.stop)
+            for late in explorer.finish():
+                yield late
+                step = replace(late, stop=step.stop)
             step = replace(step, reasons=explorer.scene.reasons())
             lost = goal is not None and all(o.id != goal for o in step.graph.objects)
             yield replace(step, stop=f"{step.stop}; {goal} was not found") if lost else step
             return
+
+
+def _plan(explorer: Explorer, early_stop: bool) -> str | None:
+    """Plan the next view; return why this one is the last, or None."""
+    active, taken = explorer.scene.config.active, explorer.scene.views + len(explorer.scene.open)
+    if (reason := used_up(taken, active)) is None and explorer.plan().stop is None and early_stop:
+        reason = explorer.reason_to_stop()
+    return reason
 
 
 def reason_to_stop(state: PlanningState, changed: bool, planner: Planner, decision: Decision) -> str | None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import Config, SegmentationMethod
-from caryatid.errors import InputError, NoSurfaceError, WrongViewError, check_type
+from caryatid.errors import CaryatidError, InputError, NoSurfaceError, WrongViewError, check_type
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import UP, Array
@@ -33,7 +33,7 @@ from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
 from caryatid.objects.reasons import Reasons
 from caryatid.runtime import Pictured, call
-from caryatid.runtime.parallel import in_background, one_blas_thread
+from caryatid.runtime.parallel import check_budget, in_background, one_blas_thread
 from caryatid.segmentation.diagnosis import (
     check_camera,
     check_depth,
@@ -237,9 +237,9 @@ class Scene(Pictured):
         so a copy costs almost nothing.
         """
         other = copy.copy(self)
-        other._models = self._models.copy()
-        other._registration = None if self._registration is None else self._registration.copy()
-        other._detector = self._detector.copy()
+        other._models = other._models.copy()
+        other._registration = None if other._registration is None else other._registration.copy()
+        other._detector = other._detector.copy()
         return other
 
     def __getstate__(self) -> dict[str, Any]:
@@ -258,7 +258,7 @@ class Scene(Pictured):
         Raises:
             InputError: The object is unknown, or it is the support surface.
         """
-        self.update()
+        self._finish()
         self._forget(self._object(object_id))
         self._reported("removed", object_id)
         return self.graph
@@ -276,7 +276,7 @@ class Scene(Pictured):
         Raises:
             InputError: The object is unknown, it is the support surface, or T is not a rigid transform.
         """
-        self.update()
+        self._finish()
         self._forget(self._object(object_id), transforms.as_rigid(T, "T"))
         self._reported("moved", object_id)
         return self.graph
@@ -294,7 +294,7 @@ class Scene(Pictured):
         Raises:
             InputError: The scene has no views, the shape is not in metres, or the label is not free.
         """
-        self.update()
+        self._finish()
         if self.voxels is None:
             raise InputError("scene", "has no views", "add a view first")
         check_type("shape", shape, Shape, "give a Box, a Cylinder, a Sphere or a Solid")
@@ -310,6 +310,13 @@ class Scene(Pictured):
         self.voxels = self.voxels.forgotten(self.voxels.within(shape, np.zeros((0, 3))))
         self._reported("added", object_id(label))
         return object_id(label)
+
+    def _finish(self) -> None:
+        """Add the open views before something is reported; one that cannot be added is left out."""
+        try:
+            self.update()
+        except CaryatidError as error:
+            log.warning(LEFT_OUT, error)
 
     def _object(self, object_id: str) -> SceneObject:
         """The object with this id.
@@ -382,7 +389,8 @@ class Scene(Pictured):
             source: The view or cloud; None goes on with those in `open`.
             budget: Time after which this returns [s]; None = all views are added first. The work goes on in
                 the background, and the next call takes over what is done by then: the graph is always that
-                of whole views, and after enough calls the same as without a budget.
+                of whole views, and after enough calls the same as without a budget. A call also raises the
+                error of a view that was open; the one given to it then is open, and need not be given again.
 
         Raises:
             InputError: Required labels are missing, a later view has no pose, or the budget is negative.
@@ -397,8 +405,6 @@ class Scene(Pictured):
             if len(self.waiting) == kept:
                 raise
             log.warning(KEPT, error)
-            if budget is None and self.open:
-                self.update()
         return self.graph
 
     def updates(
@@ -410,9 +416,7 @@ class Scene(Pictured):
             NoSurfaceError: The view shows no support surface; if it has a pose, it is kept.
             CaryatidError: As for `update`.
         """
-        end = perf_counter() + (np.inf if budget is None else budget)
-        if budget is not None and not budget >= 0.0:
-            raise InputError("budget", f"{budget} is not a time", "give seconds, such as 0.2")
+        budget, started, failure = check_budget(budget), perf_counter(), None
         if source is not None:
             check_type("source", source, (View, Cloud), "give a View or a Cloud")
             if budget is None and not self.open:
@@ -425,22 +429,30 @@ class Scene(Pictured):
                 views = ahead._add(self.open[0])
                 self._work = ahead, views, in_background(next, views, None)
             ahead, views, job = self._work
-            if not wait([job], None if budget is None else max(end - perf_counter(), 0.0)).done:
+            left = None if budget is None else max(started + budget - perf_counter(), 0.0)
+            if not wait([job], left).done:
                 return
-            # The next view, if any, goes on changing the objects of `ahead`.
-            vars(self).update(vars(ahead.copy()) | {"open": self.open, "_work": None})
-            done = None
-            try:
-                done = job.result()
-            finally:
-                if done is None:
-                    self.open = self.open[1:]
-            if done is not None:
+            # Kept views come before the one that is open.
+            done, error = None, job.exception()
+            if error is None and (done := job.result()) is not self.open[0]:
+                vars(self).update(vars(ahead.copy()) | {"open": self.open})
                 self._work = ahead, views, in_background(next, views, None)
+            else:
+                vars(self).update(vars(ahead) | {"open": self.open[1:], "_work": None})
+            if error is not None:
+                if budget is not None or not isinstance(error, CaryatidError):
+                    raise error
+                if failure is not None:
+                    log.warning(LEFT_OUT, error)
+                failure = failure or error
+            elif done is not None:
                 yield done
+        if failure is not None:
+            raise failure
 
     def _add(self, source: View | Cloud) -> Iterator[View | Cloud]:
         """Add a view or cloud, after the kept views; yield each when it is part of the model."""
+        given = source
         if isinstance(source, View):
             check_camera(source, self.config.cloud.max_coordinate)
             if not self.views and not self.waiting:
@@ -458,8 +470,8 @@ class Scene(Pictured):
         try:
             if self.waiting:
                 self.surfaces = self._observed(source).surfaces
-            waiting, self.waiting = self.waiting, ()
-            for view in (*waiting, source):
+            for view in (*self.waiting, source):
+                self.waiting = self.waiting[1:]
                 try:
                     self._start_again(view)
                     self._take_in(view)
@@ -473,7 +485,7 @@ class Scene(Pictured):
                     bare = self.views <= self.config.cloud.views and not self._models.points.objects
                     bare &= len(self._bare) == self.views - 1
                     self._bare = (*self._bare, view) if bare else ()
-                    yield view
+                    yield given if view is source else view
         except NoSurfaceError:
             if isinstance(source, View) and source.T_world_camera is not None:
                 self.waiting, self._labelled = (*self.waiting, source), labelled

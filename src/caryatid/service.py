@@ -91,7 +91,7 @@ class NewView(Document):
     """Grey PNG, or .npy (H, W) of integers: the object of each pixel, 0 = no object."""
     number: int | None = Field(None, ge=0)
     """Number of the view, from 0; makes retries safe: the last view is not added twice."""
-    budget: float | None = Field(None, ge=0.0)
+    budget: float | None = Field(None, ge=0.0, le=3600.0)
     """Time [s] after which to answer with status 202 that the view is `open`: it is still being added, and
     has to be sent again; null = wait."""
 
@@ -157,9 +157,10 @@ class SessionPool:
             raise HTTPException(503, f"{reason}; session.min_free is {least / 1e9:.1f} GB", LATER)
 
     def close(self, most: int = 0) -> None:
-        """Close all sessions but this number of the most recently used ones."""
-        while len(self._open) > most:
-            self._open.pop(next(iter(self._open))).close()
+        """Close all sessions but this number of the most recently used ones, and those that add a view."""
+        idle = [name for name, session in self._open.items() if not most or not session.is_busy]
+        for name in idle[: max(len(self._open) - most, 0)]:
+            self._open.pop(name).close()
 
 
 def make_app(

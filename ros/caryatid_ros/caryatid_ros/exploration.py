@@ -40,7 +40,8 @@ class Exploration:
         planning_scene: Shows the graph, and an object that was lifted, to a motion planner.
 
     Attributes:
-        scene: The newest scene; it is replaced, and changes only to take over views in the background.
+        scene: The newest scene; it is replaced, and changes only when it takes over views that the background
+            has finished.
         graph: Its graph as a message.
         max_views: Default maximum number of views of a goal.
 
@@ -145,7 +146,7 @@ class Exploration:
             if self._session is not None:
                 self._session.keep(view, scene)
         except BaseException:
-            explorer.step = step
+            explorer.step = explorer.step if scene is self.scene else step
             self._replace(self.scene)
             raise
         self._replace(scene)
@@ -158,7 +159,7 @@ class Exploration:
 
     def finish(self) -> Any:
         """Wait for views that are still being added; the graph is published and returned."""
-        if self.scene.open:
+        if self._settings.budget:
             self._explorer.finish()
             self.publish()
         return self.graph
@@ -178,12 +179,17 @@ class Exploration:
         """Plan the next view, or another one if that was refused: its Decision, or why there is none."""
         step = self._explorer.put_aside(refusal) if refusal else self._explorer.plan()
         stop = step.stop or (None if refusal else self._explorer.reason_to_stop())
+        if stop is not None and self.scene.open:
+            self.finish()
+            step = self._explorer.plan()
+            stop = step.stop or self._explorer.reason_to_stop()
         if stop is not None or step.decision is None:
             return None, stop
         return messages.decision_message(self._make, step.decision, self.header), None
 
     def remove(self, request: Any, response: Any) -> None:
         """Report that an object was removed or moved, publish the graph, and fill in a Removed response."""
+        self.finish()
         motion, T, scene, before = request.motion, None, self._known().copy(), self.scene.graph
         if request.moved:
             T = messages.matrix_of(motion.rotation, motion.translation, "motion")

@@ -77,6 +77,7 @@ def clear(
             yield step
             return
         explorer.look()
+        explorer.finish()
         views += 1
         lift, reason = _lift(explorer, goal, hands, threads, views, reachable)
         if lift is not None:

@@ -592,6 +592,7 @@ class ObjectModels:
         self._undivided = {k: n for k, n in self._undivided.items() if k not in labels}
         self._apart = {pair: n for pair, n in self._apart.items() if not labels & set(pair)}
         self._owners = {k: known for k, known in self._owners.items() if k not in labels}
+        self._fitted = {k: known for k, known in self._fitted.items() if k not in labels}
 
     def _noise(self) -> float:
         """Standard deviation of points from their surfaces [m]: the table's, or the primitives' if larger.

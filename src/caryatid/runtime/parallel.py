@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache, partial, wraps
 from pathlib import Path
-from threading import Lock
+from threading import TIMEOUT_MAX, Lock
 from typing import Any, ParamSpec, TypeVar
 
 import numba
@@ -25,7 +25,7 @@ from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 from threadpoolctl import ThreadpoolController
 
-from caryatid.errors import InputError
+from caryatid.errors import InputError, check_type
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
@@ -170,6 +170,20 @@ def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
     for share in shares:
         share.result()
     return results
+
+
+def check_budget(budget: float | None) -> float | None:
+    """Return a time [s] that a thread can wait for, or None for no limit.
+
+    Raises:
+        InputError: It is no number of at least 0.
+    """
+    if budget is None:
+        return None
+    check_type("budget", budget, (float, int), "give seconds, such as 0.2")
+    if not budget >= 0.0:
+        raise InputError("budget", f"{budget} is not a time", "give seconds, such as 0.2")
+    return min(budget, TIMEOUT_MAX / 2.0)
 
 
 def in_background(task: Callable[P, Result], *args: P.args, **kwargs: P.kwargs) -> Future[Result]:

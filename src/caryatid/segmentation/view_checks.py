@@ -46,11 +46,14 @@ def check_masks(view: View, eye_world: Array | None, surface: SupportSurface, co
         return
     # At the borders of masks, sensors often have no reading.
     cross = generate_binary_structure(2, 1)
-    least, most = (f(view.labels, footprint=cross) for f in (minimum_filter, maximum_filter))
+    least, most = (
+        f(view.labels, footprint=cross, mode="constant", cval=-1) for f in (minimum_filter, maximum_filter)
+    )
     inner = np.where(least == most, view.labels, 0)
     pixels, readings = np.bincount(inner.ravel()), np.bincount(inner[view.depth > 0.0])
     readings = np.pad(readings, (0, len(pixels) - len(readings)))
-    lost = np.flatnonzero((pixels >= enough) & (readings < config.fit.min_points))
+    few = readings < np.minimum(pixels, config.fit.min_points)
+    lost = np.flatnonzero((pixels >= enough) & few)
     if names := ", ".join(map(str, lost[lost > 0].tolist())):
         log.warning("%s: too few depth readings in mask %s; its object is missed", view.name, names)
 

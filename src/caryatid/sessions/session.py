@@ -47,7 +47,7 @@ from caryatid.robots import HUMANOID, Robot, Surroundings, find_robot, view_sphe
 from caryatid.robots.floor import STEP, FloorGrid
 from caryatid.robots.protocol import straight_lengths
 from caryatid.runtime import fingerprint
-from caryatid.runtime.parallel import in_background
+from caryatid.runtime.parallel import check_budget, in_background
 from caryatid.scene import KEPT, Scene
 from caryatid.segmentation.diagnosis import describe_camera
 from caryatid.sensing.view_sphere import ViewSphere
@@ -304,6 +304,7 @@ class Session:
                 raise SessionConflictError(view.name, reason)
             return self._added()
         self._check_alike(view)
+        budget = check_budget(budget)
         if self._open is not None and self._open[0] != event.digest:
             self._check_not_open()
         if self._open is None and budget is None:
@@ -326,10 +327,17 @@ class Session:
             graph_text(scene.update(view))
         return scene, warnings
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether a view is being added in the background."""
+        return self._open is not None and not self._open[1].done()
+
     def _check_not_open(self) -> None:
-        if self._open is not None:
+        """Refuse what would overtake an open view; one that nobody asked for again is dropped."""
+        if self.is_busy:
             reason = f"view {self.views} is still being added"
-            raise SessionConflictError(self.path, reason, "send that view again until it is")
+            raise SessionConflictError(self.path, reason, "send that view again until it is added")
+        self._open = None
 
     def keep(self, view: View, scene: Scene) -> None:
         """Add a view with which a copy of the scene was updated; once this returns, the view is on disk.
@@ -338,6 +346,7 @@ class Session:
             InputError: The view cannot be kept; the session does not change.
         """
         self._check_writable()
+        self._check_not_open()
         self._check_alike(view)
         graph_text(scene.graph)
         self._add(view, *self._packed(view), scene)
