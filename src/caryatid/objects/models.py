@@ -386,7 +386,7 @@ class ObjectModels:
         self.points.bound(edges, config.cloud.views, config.cloud.depth)
         return {label for label in shown if label <= MAX_LABEL}
 
-    def outdated(self, labels: set[int], voxels: VoxelMap) -> set[int]:
+    def find_outdated(self, labels: set[int], voxels: VoxelMap) -> set[int]:
         """Find the objects among these whose shapes a new view may change.
 
         A shape holds while it explains the newest points as well as true shapes do, on sides that earlier

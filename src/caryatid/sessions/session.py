@@ -308,9 +308,9 @@ class Session:
         if self._open is not None and self._open[0] != event.digest:
             self._check_not_open()
         if self._open is None and budget is None:
-            scene, warnings = self._updated(view)
+            scene, warnings = self._update_copy(view)
         else:
-            job = in_background(self._updated, view) if self._open is None else self._open[1]
+            job = in_background(self._update_copy, view) if self._open is None else self._open[1]
             self._open = event.digest, job
             if not wait([job], budget).done:
                 return replace(self._added(), number=self.views, open=True)
@@ -320,8 +320,8 @@ class Session:
         self._warnings = warnings
         return self._added()
 
-    def _updated(self, view: View) -> tuple[Scene, list[str]]:
-        """The scene with a view whose graph can be written, and the warnings."""
+    def _update_copy(self, view: View) -> tuple[Scene, list[str]]:
+        """Add a view to a copy of the scene, whose graph can be written; return it and the warnings."""
         scene = self.scene.copy()
         with _collected_warnings() as warnings:
             graph_text(scene.update(view))
