@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.errors import InputError, check_type
@@ -116,7 +117,7 @@ def candidates(
 
     Arguments are as in `fit`. With `whole`, sides that should have been seen cost by their bare share.
     """
-    fits, judged_by = _ranked(*_finite(points, normals), config, rng)
+    fits, judged_by = _ranked(points, normals, config, rng)
     return sorted((_with_bare(f, judged_by) for f in fits), key=lambda f: f.cost) if whole else fits
 
 
@@ -131,19 +132,17 @@ def free_inside(shape: Shape, voxels: VoxelMap, inset: float) -> tuple[int, int]
     Returns:
         Number of cubes of a voxel's size, 0 if the shape is too thin, and of those in voxels seen free.
     """
-    half = shape.extents / 2.0 - inset
-    if half.min() <= 0.0:
-        return 0, 0
-    inside, free = _count_free(
-        shape.code, shape.T_world_object, half, voxels.states, voxels.origin_world, voxels.config.size
-    )
+    kind, R, centre, half = shape.row
+    inside, free = count_free(kind, R, centre, half - inset, *voxels.space)
     return inside, free
 
 
 @kernel
-def _count_free(kind, T, half, states, origin, size):  # type: ignore[no-untyped-def]
+def count_free(kind, R, centre, half, states, origin, size):  # type: ignore[no-untyped-def]
     """Count the cubes of a grid in a shape, and those whose centres lie in free voxels."""
     inside = free = 0
+    if not min(half[0], half[1], half[2]) > 0.0:
+        return inside, free
     first, count = np.zeros(3), np.ones(3, np.intp)
     for a in range(3):
         # A row of cubes begins at the surface; one that does not fit in lies in the middle.
@@ -160,12 +159,19 @@ def _count_free(kind, T, half, states, origin, size):  # type: ignore[no-untyped
                 if across > half[0] * half[0]:
                     continue
                 inside += 1
-                x = math.floor((T[0, 0] * u + T[0, 1] * v + T[0, 2] * w + T[0, 3] - origin[0]) / size)
-                y = math.floor((T[1, 0] * u + T[1, 1] * v + T[1, 2] * w + T[1, 3] - origin[1]) / size)
-                z = math.floor((T[2, 0] * u + T[2, 1] * v + T[2, 2] * w + T[2, 3] - origin[2]) / size)
-                if 0 <= x < states.shape[0] and 0 <= y < states.shape[1] and 0 <= z < states.shape[2]:
-                    free += states[x, y, z] == FREE
+                free += is_free(R, centre, u, v, w, states, origin, size)
     return inside, free
+
+
+@inner
+def is_free(R, centre, u, v, w, states, origin, size):  # type: ignore[no-untyped-def]
+    """Whether a point in the frame of a shape lies in a voxel seen free."""
+    x = math.floor((R[0, 0] * u + R[0, 1] * v + R[0, 2] * w + centre[0] - origin[0]) / size)
+    y = math.floor((R[1, 0] * u + R[1, 1] * v + R[1, 2] * w + centre[1] - origin[1]) / size)
+    z = math.floor((R[2, 0] * u + R[2, 1] * v + R[2, 2] * w + centre[2] - origin[2]) / size)
+    if 0 <= x < states.shape[0] and 0 <= y < states.shape[1] and 0 <= z < states.shape[2]:
+        return states[x, y, z] == FREE
+    return False
 
 
 def _finite(points: Array, normals: Array) -> tuple[Array, Array]:
@@ -200,35 +206,59 @@ def _ranked(
     points: Array, normals: Array, config: FitConfig, rng: np.random.Generator
 ) -> tuple[list[Fit], Array]:
     """The best fit of each shape, lowest cost first, and the points (N, 3) by which they are scored."""
-    if len(points) < config.min_points:
-        return [], points
-    count = min(len(points), config.max_points)
-    every = max(1, count // config.search_points)
-    if every > 1 or count < len(points):
-        # Shuffled: points come row by row, and every n-th of a row would leave out whole columns.
-        drawn = rng.choice(len(points), count, replace=False)
-        points, normals = points[drawn], normals[drawn]
-    origin = points.mean(axis=0)
-    centred = points - origin
-    some, facing = centred[::every].copy(), normals[::every].copy()
+    kinds, rows, scores, seen, points = fit_each(points, normals, config, rng)
+    fits = [
+        Fit(as_shape(kind, row), residual, inliers, tuple(sides), cost)
+        for kind, row, (cost, residual, inliers), sides in zip(
+            kinds, rows, scores.tolist(), seen.tolist(), strict=True
+        )
+    ]
+    return fits, points
+
+
+def as_shape(kind: type[Shape], row: Array) -> Shape:
+    """The shape of a kind with axes, centre and half extents (5, 3)."""
+    return kind.from_extents(transforms.rigid(row[:3], row[3]), 2.0 * row[4])
+
+
+def fit_each(
+    points: Array, normals: Array, config: FitConfig, rng: np.random.Generator
+) -> tuple[list[type[Shape]], Array, Array, NDArray[np.bool_], Array]:
+    """Fit each kind of shape.
+
+    Returns:
+        The kinds that fit, the one of the lowest cost first; their axes, centres and half extents (K, 5, 3);
+        cost, residual and share of inliers (K, 3); the sides that points confirm (K, 6); and the points
+        (N, 3) by which they are scored.
+    """
+    points, normals = _finite(points, normals)
     kinds = [KINDS[kind] for kind in config.shapes]
-    samples = rng.integers(0, -(-count // every), size=(len(kinds), config.hypotheses, 2))
-    rows = len(kinds), config.polish + 2
-    shapes, score = np.empty((*rows, 5, 3)), np.full((*rows, 3), np.inf)
-    seen = np.empty((*rows, 6), dtype=np.bool_)
-    best = _best_of_each(
-        np.array([kind.code for kind in kinds]), centred, normals, some, facing, samples, config.steps,
-        config.threshold, config.max_radius, config.max_extent, config.min_extent, config.normal_weight,
-        config.min_points, shapes, score, seen,
-    )  # fmt: skip
-    fits = []
-    for number, (kind, row) in enumerate(zip(kinds, best.tolist(), strict=True)):
-        if row >= 0:
-            found = shapes[number, row]
-            shape = kind.from_extents(transforms.rigid(found[:3], found[3] + origin), 2.0 * found[4])
-            cost, residual, inliers = score[number, row].tolist()
-            fits.append(Fit(shape, residual, inliers, tuple(seen[number, row].tolist()), cost))
-    return sorted(fits, key=lambda f: f.cost), points
+    shape = len(kinds), config.polish + 2
+    shapes, scores = np.empty((*shape, 5, 3)), np.full((*shape, 3), np.inf)
+    seen = np.empty((*shape, 6), dtype=np.bool_)
+    best, origin = np.full(len(kinds), -1), np.zeros(3)
+    if len(points) >= config.min_points:
+        count = min(len(points), config.max_points)
+        every = max(1, count // config.search_points)
+        if every > 1 or count < len(points):
+            # Shuffled: points come row by row, and every n-th of a row would leave out whole columns.
+            drawn = rng.choice(len(points), count, replace=False)
+            points, normals = points[drawn], normals[drawn]
+        origin = points.mean(axis=0)
+        centred = points - origin
+        some, facing = centred[::every].copy(), normals[::every].copy()
+        samples = rng.integers(0, -(-count // every), size=(len(kinds), config.hypotheses, 2))
+        best = _best_of_each(
+            np.array([kind.code for kind in kinds]), centred, normals, some, facing, samples, config.steps,
+            config.threshold, config.max_radius, config.max_extent, config.min_extent, config.normal_weight,
+            config.min_points, shapes, scores, seen,
+        )  # fmt: skip
+    found = np.flatnonzero(best >= 0)
+    found = found[np.argsort(scores[found, best[found], 0], kind="stable")]
+    which = found, best[found]
+    rows = shapes[which]
+    rows[:, 3] += origin
+    return [kinds[k] for k in found], rows, scores[which], seen[which], points
 
 
 @kernel

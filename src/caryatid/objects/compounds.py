@@ -12,18 +12,15 @@ from itertools import product
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from caryatid.config import ExplanationConfig
+from caryatid.fitting.primitives import is_free
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Shape
 from caryatid.geometry.signed_distance import gradient, local
 from caryatid.geometry.transforms import UP, Array
 from caryatid.runtime.parallel import kernel
 from caryatid.sensing.voxel_map import VoxelMap
-
-Index = NDArray[np.intp]
-"""Indices (M,) of points."""
 
 FEW = 5
 """Minimum number of points of a face [1]; 3 cm² of them."""
@@ -78,12 +75,11 @@ class Revolution:
 
     def costs(self, points: Array, normals: Array, noise: float, config: ExplanationConfig) -> Array:
         """Cost (N,) [nats] of oriented points (N, 3), each on the face that explains it best."""
-        places, facing = _profile(points, normals, self.middle, self.axis)
-        least = np.full(len(points), config.outlier)
-        for (begin, end), outward in zip(self.ends, self.outward, strict=True):
-            own = _costs(*_from_face(places, facing, begin, end, outward), noise, config)
-            least = np.minimum(least, own)
-        return least
+        seen = _profile(points, normals, self.middle, self.axis)
+        costs = np.full(len(points), config.outlier)
+        for face in zip(self.ends, self.outward, strict=True):
+            _lower(*seen, *face, noise, config.normal_weight, costs)
+        return costs
 
     def surface(self, spacing: float) -> tuple[Array, Array]:
         """Points (N, 3) of its faces, this far from each other all around [m], outward normals (N, 3)."""
@@ -132,56 +128,76 @@ def revolutions(
         if np.count_nonzero(seen > 0.02 * len(points)) < ROUND:
             continue
         step = max(1, len(places) // ENOUGH)
-        ends, outward = _faces(places[::step], facing[::step], noise, step * weight, config)
-        if len(ends):
-            yield Revolution(middle, axis, ends, outward)
+        ends, outward = np.empty((FACES, 2, 2)), np.empty((FACES, 2))
+        count = _find_faces(
+            places[::step].copy(), facing[::step].copy(), noise, config.normal_weight, config.outlier,
+            config.irregular, config.reach, 2.0 * config.parameter_cost / (step * weight), ends, outward,
+        )  # fmt: skip
+        if count:
+            yield Revolution(middle, axis, ends[:count], outward[:count])
 
 
-def _faces(
-    places: Array, facing: Array, noise: float, weight: float, config: ExplanationConfig
-) -> tuple[Array, Array]:
-    """Ends (K, 2, 2) and normals (K, 2) of the faces of a profile, one by one while each saves cost."""
-    tried = np.flatnonzero(np.linalg.norm(facing, axis=1) > ALIKE)
+@kernel
+def _find_faces(  # type: ignore[no-untyped-def]
+    places, facing, noise, normal_weight, outlier, irregular, gap, least, ends, outward
+):
+    """Write ends (K, 2, 2) and normals (K, 2) of the faces of a profile, and return how many they are.
+
+    They are found one by one among planes through points, while each lowers the sum of costs by the least.
+    """
+    tried = np.flatnonzero(facing[:, 0] ** 2 + facing[:, 1] ** 2 > ALIKE**2)
     tried = tried[:: max(1, len(tried) // HYPOTHESES)]
-    planes = transforms.unit(facing[tried])
-    offset = np.einsum("hi,hi->h", places[tried], planes)
-    costs = _costs(places @ planes.T - offset, facing @ planes.T, noise, config)
-    left = np.full(len(places), config.outlier)
-    ends: list[tuple[Array, Array]] = []
-    outward: list[Array] = []
-    while len(tried) and len(ends) < FACES:
-        best = int(np.maximum(left[:, None] - costs, 0.0).sum(axis=0).argmax())
-        own = np.flatnonzero((costs[:, best] < config.irregular) & (costs[:, best] < left))
-        if len(own) < 3:
-            break
-        face = transforms.unit(facing[own].mean(axis=0))
-        across = np.array([-face[1], face[0]])
-        own = _longest_run(own, places @ across, config.reach)
-        centre, along = places[own].mean(axis=0), places[own] @ across
-        span = np.array([along.min(), along.max()]) - centre @ across
-        begin, end = centre + span[:, None] * across
-        cost = np.minimum(left, _costs(*_from_face(places, facing, begin, end, face), noise, config))
-        if (left - cost).sum() * weight <= 2.0 * config.parameter_cost:
-            break
-        left = cost
-        ends.append((begin, end))
-        outward.append(face)
-    return np.array(ends), np.array(outward)
+    costs, left = np.empty((len(tried), len(places))), np.full(len(places), outlier)
+    for h, i in enumerate(tried):
+        x, y = facing[i] / np.sqrt(facing[i, 0] ** 2 + facing[i, 1] ** 2)
+        for j in range(len(places)):
+            distance = (places[j, 0] - places[i, 0]) * x + (places[j, 1] - places[i, 1]) * y
+            turned = 1.0 - facing[j, 0] * x - facing[j, 1] * y
+            costs[h, j] = min(distance**2 / (2.0 * noise**2) + normal_weight * turned, outlier)
+    for count in range(len(ends) if len(tried) else 0):
+        best, most = costs[0], 0.0
+        for own in costs:
+            saved = 0.0
+            for j in range(len(places)):
+                saved += max(left[j] - own[j], 0.0)
+            if saved > most:
+                best, most = own, saved
+        near = np.flatnonzero((best < irregular) & (best < left))
+        if len(near) < 3:
+            return count
+        x, y = facing[near, 0].sum(), facing[near, 1].sum()
+        x, y = x / np.sqrt(x * x + y * y), y / np.sqrt(x * x + y * y)
+        # Of the points on the face, those that no gap separates from most others.
+        along = places[near, 1] * x - places[near, 0] * y
+        ordered, first, begin, end = np.sort(along), 0, 0, 0
+        for j in range(1, len(ordered) + 1):
+            if j == len(ordered) or ordered[j] - ordered[j - 1] > gap:
+                if j - first > end - begin:
+                    begin, end = first, j
+                first = j
+        near = near[(along >= ordered[begin]) & (along <= ordered[end - 1])]
+        level = (places[near, 0].mean() * x) + (places[near, 1].mean() * y)
+        for side, place in enumerate((ordered[begin], ordered[end - 1])):
+            ends[count, side, 0], ends[count, side, 1] = level * x - place * y, level * y + place * x
+        outward[count, 0], outward[count, 1] = x, y
+        before = left.sum()
+        _lower(places, facing, ends[count], outward[count], noise, normal_weight, left)
+        if before - left.sum() <= least:
+            return count
+    return len(ends) if len(tried) else 0
 
 
-def _longest_run(own: Index, along: Array, gap: float) -> Index:
-    """Those of some points (M,) along a line (N,) [m] that no gap separates from most of the others."""
-    own = own[np.argsort(along[own])]
-    run = np.cumsum(np.append(False, np.diff(along[own]) > gap))
-    return own[run == np.bincount(run).argmax()]
-
-
-def _from_face(places: Array, facing: Array, begin: Array, end: Array, outward: Array) -> tuple[Array, Array]:
-    """Distance (N,) [m] of places (N, 2) from a face of a profile, and cosine (N,) of their normals."""
-    length = float(np.linalg.norm(end - begin))
-    along = (end - begin) / max(length, 1e-9)
-    beyond = np.abs((places - (begin + end) / 2.0) @ along) - length / 2.0
-    return np.hypot((places - begin) @ outward, np.maximum(beyond, 0.0)), facing @ outward
+@kernel
+def _lower(places, facing, ends, outward, noise, normal_weight, costs):  # type: ignore[no-untyped-def]
+    """Lower the costs (N,) of places (N, 2) with normals (N, 2) to those on a face, where these are less."""
+    x, y = outward[0], outward[1]
+    low, high = ends[0, 1] * x - ends[0, 0] * y, ends[1, 1] * x - ends[1, 0] * y
+    for i in range(len(places)):
+        off = (places[i, 0] - ends[0, 0]) * x + (places[i, 1] - ends[0, 1]) * y
+        along = places[i, 1] * x - places[i, 0] * y
+        beyond = max(low - along, along - high, 0.0)
+        turned = 1.0 - facing[i, 0] * x - facing[i, 1] * y
+        costs[i] = min(costs[i], (off**2 + beyond**2) / (2.0 * noise**2) + normal_weight * turned)
 
 
 def _axes(points: Array, normals: Array, noise: float) -> Iterator[tuple[Array, Array]]:
@@ -191,29 +207,26 @@ def _axes(points: Array, normals: Array, noise: float) -> Iterator[tuple[Array, 
     normals that pass it at a distance lose their weight. On a bowl, which is nearly a ball, all lines through
     the middle fit about as well: then the vertical is tried too.
     """
-    centre = points.mean(axis=0)
-    moments = np.cross(points - centre, normals)
-    weights = np.ones(len(points))
+    centre, weights = points.mean(axis=0), np.ones(len(points))
+    lines = np.concatenate([np.cross(points - centre, normals), normals], axis=1)
     for _ in range(4):
-        mm, mn, nn = _products(moments, normals, weights)
+        mm, mn, nn = _products(lines, weights)
         solved = np.linalg.solve(nn, mn.T)
         axes = np.linalg.eigh(mm - mn @ solved)[1].T
-        moment = -solved @ axes[0]
-        weights = _weights(moments @ axes[0] + normals @ moment, noise)
+        weights = _weights(lines @ np.concatenate([axes[0], -solved @ axes[0]]), noise)
     for axis in (axes[0], UP):
         level, weights, moment = np.stack(_across(axis), axis=1), np.ones(len(points)), np.zeros(3)
         for _ in range(4):
-            _, mn, nn = _products(moments, normals, weights)
+            _, mn, nn = _products(lines, weights)
             moment = -level @ np.linalg.solve(level.T @ nn @ level, level.T @ mn.T @ axis)
-            weights = _weights(moments @ axis + normals @ moment, noise)
+            weights = _weights(lines @ np.concatenate([axis, moment]), noise)
         yield centre + np.cross(axis, moment), axis
 
 
-def _products(moments: Array, normals: Array, weights: Array) -> tuple[Array, Array, Array]:
-    """Weighted sums (3, 3) of the products of moments (N, 3) and normals (N, 3)."""
-    weighted = weights[:, None] * normals
-    few = 1e-6 * len(normals) * np.eye(3)
-    return moments.T @ (weights[:, None] * moments), moments.T @ weighted, normals.T @ weighted + few
+def _products(lines: Array, weights: Array) -> tuple[Array, Array, Array]:
+    """Weighted sums (3, 3) of the products of the moments and the directions of lines (N, 6)."""
+    sums = lines.T @ (weights[:, None] * lines)
+    return sums[:3, :3], sums[:3, 3:], sums[3:, 3:] + 1e-6 * len(lines) * np.eye(3)
 
 
 def _weights(miss: Array, noise: float) -> Array:
@@ -265,22 +278,32 @@ class OpenBox:
 
     def free(self, voxels: VoxelMap) -> int:
         """Number of voxels seen free that it fills, with free ones on either side."""
-        return sum(free_in_slab(slab, voxels) for slab in self.slabs)
+        return sum(count_free_in_slab(*slab.row[1:], *voxels.space) for slab in self.slabs)
 
 
 Compound = Revolution | OpenBox
 """A surface that could be several primitives."""
 
 
-def free_in_slab(slab: Box, voxels: VoxelMap) -> int:
+@kernel
+def count_free_in_slab(R, centre, half, states, origin, size):  # type: ignore[no-untyped-def]
     """Number of voxels seen free that a thin box fills, with free ones on either side."""
-    axes = [_middles(n) - 0.5 for n in slab.extents / voxels.config.size]
-    local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * slab.extents
+    thin, free, count = 0, 0, np.empty(3, np.intp)
+    for a in range(3):
+        count[a] = max(np.rint(2.0 * half[a] / size), 1.0)
+        thin = a if half[a] < half[thin] else thin
     # The seen part of a surface may lie in the voxel beside it.
-    beside = 0.5 * voxels.config.size * np.eye(3)[slab.extents.argmin()]
-    around = np.concatenate([local - beside, local, local + beside])
-    free = voxels.empty_at(transforms.transform(slab.T_world_object, around))
-    return int(np.count_nonzero(free.reshape(3, -1).all(axis=0)))
+    du, dv, dw = 0.5 * size * (thin == 0), 0.5 * size * (thin == 1), 0.5 * size * (thin == 2)
+    for i in range(count[0]):
+        u = (2.0 * (i + 0.5) / count[0] - 1.0) * half[0]
+        for j in range(count[1]):
+            v = (2.0 * (j + 0.5) / count[1] - 1.0) * half[1]
+            for k in range(count[2]):
+                w = (2.0 * (k + 0.5) / count[2] - 1.0) * half[2]
+                seen = is_free(R, centre, u, v, w, states, origin, size)
+                seen = seen and is_free(R, centre, u - du, v - dv, w - dw, states, origin, size)
+                free += seen and is_free(R, centre, u + du, v + dv, w + dw, states, origin, size)
+    return free
 
 
 def open_boxes(points: Array, normals: Array, thickness: float) -> Iterator[OpenBox]:
@@ -363,29 +386,25 @@ def _middles(count: float) -> Array:
     return (np.arange(number) + 0.5) / number
 
 
-def _costs(distance: Array, cosine: Array, noise: float, config: ExplanationConfig) -> Array:
-    """Cost [nats] of points at a distance [m] from a surface whose normals make an angle with theirs."""
-    costs = distance**2 / (2.0 * noise**2) + config.normal_weight * (1.0 - cosine)
-    return np.minimum(costs, config.outlier)
-
-
 def shape_costs(
     shape: Shape, points: Array, normals: Array, noise: float, config: ExplanationConfig
 ) -> Array:
     """Cost (N,) [nats] of oriented points (N, 3) on the surface of a shape."""
-    sizes = shape.code, shape.T_world_object, shape.extents / 2.0
-    costs: Array = _point_costs(*sizes, points, normals, noise, config.normal_weight, config.outlier)
+    costs: Array = point_costs_on(*shape.row, points, normals, noise, config.normal_weight, config.outlier)
     return costs
 
 
 @kernel
-def _point_costs(kind, T, half, points, normals, noise, normal_weight, outlier):  # type: ignore[no-untyped-def]
+def point_costs_on(  # type: ignore[no-untyped-def]
+    kind, R, centre, half, points, normals, noise, normal_weight, outlier
+):
+    """Cost (N,) [nats] of oriented points (N, 3) on the surface of a shape."""
     costs, hx, hy, hz = np.empty(len(points)), half[0], half[1], half[2]
-    centre, origin = T[:3, 3], np.zeros(3)
+    origin = np.zeros(3)
     for i in range(len(points)):
-        x, y, z = local(T, centre, points, i)
+        x, y, z = local(R, centre, points, i)
         distance, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
-        u, v, w = local(T, origin, normals, i)
+        u, v, w = local(R, origin, normals, i)
         turned = 1.0 - (gx * u + gy * v + gz * w)
         costs[i] = min(distance**2 / (2.0 * noise**2) + normal_weight * turned, outlier)
     return costs

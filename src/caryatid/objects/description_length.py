@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import chain
 
 import numpy as np
@@ -11,12 +12,24 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from caryatid.config import Config, ExplanationConfig, FitConfig
-from caryatid.fitting.primitives import candidates, free_inside
+from caryatid.fitting.primitives import as_shape, count_free, fit_each
+from caryatid.geometry import BOX
 from caryatid.geometry.shapes import Box, Shape
 from caryatid.geometry.transforms import Array
-from caryatid.objects.compounds import Compound, free_in_slab, open_boxes, revolutions, shape_costs
+from caryatid.objects.compounds import (
+    Compound,
+    count_free_in_slab,
+    open_boxes,
+    point_costs_on,
+    revolutions,
+    shape_costs,
+)
+from caryatid.runtime.parallel import kernel
 from caryatid.segmentation.segments import PLAIN, colour_shares
 from caryatid.sensing.voxel_map import VoxelMap
+
+NOTHING_SEEN = np.zeros((0, 0, 0), dtype=np.int8), np.zeros(3), 1.0
+"""Space of which nothing is known."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -199,11 +212,41 @@ def free_cost(shape: Shape | Compound | None, evidence: Evidence, config: Explan
         return 0.0
     if not isinstance(shape, Shape):
         return config.free_cost * shape.free(evidence.voxels)
+    return config.free_cost * _count_free(*shape.row, evidence.noise, *evidence.voxels.space)
+
+
+@kernel
+def _count_free(kind, R, centre, half, noise, states, origin, size):  # type: ignore[no-untyped-def]
+    """Number of voxels seen free well inside a shape."""
     # A surface voxel may be half free.
-    inset = max(1.2 * evidence.voxels.config.size, 3.0 * evidence.noise)
-    if isinstance(shape, Box) and shape.extents.min() <= 2.0 * inset:
-        return config.free_cost * free_in_slab(shape, evidence.voxels)
-    return config.free_cost * free_inside(shape, evidence.voxels, inset)[1]
+    inset = max(1.2 * size, 3.0 * noise)
+    if kind == BOX and min(half[0], half[1], half[2]) <= inset:
+        return count_free_in_slab(R, centre, half, states, origin, size)
+    return count_free(kind, R, centre, half - inset, states, origin, size)[1]
+
+
+@kernel
+def _cheapest(  # type: ignore[no-untyped-def]
+    kinds, rows, prices, points, normals, noise, weight, normal_weight, outlier, free_weight, below, states,
+    origin, size,
+):  # fmt: skip
+    """Find the cheapest of some shapes (K, 5, 3) below a limit [nats], as `best_explanation` does.
+
+    Returns:
+        Its number, or −1, and its cost [nats].
+    """
+    best = -1
+    for k in range(len(kinds)):
+        R, centre, half = rows[k, :3], rows[k, 3], rows[k, 4]
+        points_cost = point_costs_on(
+            kinds[k], R, centre, half, points, normals, noise, normal_weight, outlier
+        )
+        cost = points_cost.sum() * weight + prices[k]
+        if cost < below:
+            cost += free_weight * _count_free(kinds[k], R, centre, half, noise, states, origin, size)
+        if cost < below:
+            best, below = k, cost
+    return best, below
 
 
 def explain(
@@ -223,9 +266,25 @@ def explain(
         rng: Source of the samples.
         first_look: Make a quick fit, which only tells what is worth a full one.
     """
-    if first_look:
-        settings = replace(fit_config, polish=1, hypotheses=10, steps=6, max_points=150)
-    else:
-        settings = replace(fit_config, polish=1, search_points=fit_config.max_points)
-    fits = candidates(evidence.points, evidence.normals, config=settings, rng=rng, whole=False)
-    return best_explanation([f.shape for f in fits], evidence, config)
+    settings = _quick(fit_config) if first_look else _thorough(fit_config)
+    kinds, rows, *_ = fit_each(evidence.points, evidence.normals, settings, rng)
+    best, cost = _cheapest(
+        np.array([kind.code for kind in kinds], dtype=np.intp), rows,
+        config.parameter_cost * np.array([float(kind.parameters) for kind in kinds]),
+        np.ascontiguousarray(evidence.points), np.ascontiguousarray(evidence.normals), evidence.noise,
+        evidence.weight, config.normal_weight, config.outlier, config.free_cost,
+        _cost(None, evidence, config), *(NOTHING_SEEN if evidence.voxels is None else evidence.voxels.space),
+    )  # fmt: skip
+    return Explanation(as_shape(kinds[best], rows[best]) if best >= 0 else None, cost)
+
+
+@cache
+def _quick(config: FitConfig) -> FitConfig:
+    """Settings of a first look."""
+    return replace(config, polish=1, hypotheses=10, steps=6, max_points=150)
+
+
+@cache
+def _thorough(config: FitConfig) -> FitConfig:
+    """Settings of a full fit."""
+    return replace(config, polish=1, search_points=config.max_points)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, MutableMapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -24,13 +24,12 @@ from caryatid.objects.description_length import (
     colour_evidence,
     explain,
     explained,
-    plain_colour,
     point_costs,
     price,
     side_colours,
     unity,
 )
-from caryatid.runtime.parallel import on_threads
+from caryatid.runtime.parallel import kernel, on_threads
 from caryatid.segmentation.segments import PLAIN
 
 Groups = NDArray[np.intp]
@@ -39,6 +38,8 @@ Pair = tuple[int, int]
 
 GROWTH = 1.3
 """A decision for one object or two is revised once the number of points has grown by this factor [1]."""
+CONNECTED = 0.02
+"""Maximum gap between points of one part [m]; twice their spacing and more."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -144,7 +145,8 @@ def best_division(
     costs = config.explanation
     if len(evidence) < 2 * config.split.min_points:
         return None
-    near = _neighbours(evidence.points)
+    tree = cKDTree(evidence.points)
+    near, pairs = _neighbours(tree), tree.query_pairs(CONNECTED, output_type="ndarray")
     own = point_costs(whole.shape, evidence, costs)
     misfit = own[near].mean(axis=1)
     excess = float(np.maximum(misfit - costs.usual, 0.0).sum()) * evidence.weight
@@ -155,12 +157,12 @@ def best_division(
     if excess + free + colours < costs.parameter_cost * min(kind.parameters for kind in KINDS.values()):
         return None
     starts += _hypotheses(evidence, misfit, config)
-    looks = _settled(evidence, starts, hinted, near, config, rng, first_look=True)
+    looks = _settled(evidence, starts, hinted, near, pairs, config, rng, first_look=True)
     # The best two of those with a shape for one side at least are settled with full fits.
     shaped = {k: look.cost for k, look in looks.items() if any(e.shape for e in look.explanations)}
     tried = sorted(sorted(shaped, key=shaped.__getitem__)[:2])
     hinted = sum(k < hinted for k in tried)
-    settled = _settled(evidence, [starts[k] for k in tried], hinted, near, config, rng)
+    settled = _settled(evidence, [starts[k] for k in tried], hinted, near, pairs, config, rng)
     proper = [two for two in settled.values() if two.by_colour or not _is_layer(evidence, two)]
     return min(proper, key=lambda two: two.cost, default=None)
 
@@ -184,6 +186,7 @@ def _settled(
     starts: Sequence[Mask],
     hinted: int,
     near: Groups,
+    pairs: Groups,
     config: Config,
     rng: np.random.Generator,
     *,
@@ -223,7 +226,8 @@ def _settled(
                 colours = side_colours(rgb, (rgb[~second], rgb[second]), config.explanation)
                 cost = cost * evidence.weight + colours
             cost = (cost + cost[:, near].mean(axis=2)) / 2.0
-            seconds[k] = _connected(evidence.points, cost[1] < cost[0])
+            seconds[k] = cost[1] < cost[0]
+            _keep_connected(pairs, seconds[k])
     settled: dict[int, TwoObjects] = {}
     for k, pair in explained_sides(first_look):
         gain = _colours(evidence, seconds[k], config.explanation) if k < hinted else 0.0
@@ -276,31 +280,47 @@ def _separated_pieces(evidence: Evidence, config: Config) -> Groups | None:
     return groups if groups.any() else None
 
 
-def _components(points: Array, gap: float = 0.02) -> Groups:
-    """Connected part (N,) of each point, from 0; a gap [m], of twice their spacing and more, parts two."""
+def _components(points: Array, gap: float = CONNECTED) -> Groups:
+    """Connected part (N,) of each point, from 0; a gap [m] parts two."""
     pairs = cKDTree(points).query_pairs(gap, output_type="ndarray")
     graph = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
 
 
-def _connected(points: Array, second: Mask) -> Mask:
-    """Keep the largest connected part of the second side, and of the first all but crumbs (2 cm²)."""
-    result = second.copy()
-    for side, least in ((True, np.inf), (False, 8)):
-        index = np.flatnonzero(result == side)
-        if len(index):
-            part = _components(points[index])
-            sizes = np.bincount(part)
-            small = sizes < min(least, sizes.max())
-            if side:
-                small[np.flatnonzero(~small)[1:]] = True
-            result[index[small[part]]] = not side
-    return result
+@kernel
+def _keep_connected(pairs, second):  # type: ignore[no-untyped-def]
+    """Keep the largest connected part of the second side (N,), and of the first all but crumbs (2 cm²).
+
+    Pairs (P, 2) of points are near each other. The side is changed.
+    """
+    for side, least in ((True, len(second)), (False, 8)):
+        part, sizes = np.arange(len(second)), np.zeros(len(second), np.intp)
+        for a, b in pairs:
+            if second[a] == side and second[b] == side:
+                while part[a] != a:
+                    part[a] = a = part[part[a]]
+                while part[b] != b:
+                    part[b] = b = part[part[b]]
+                part[max(a, b)] = min(a, b)
+        for i in range(len(second)):
+            part[i] = part[part[i]]
+            sizes[part[i]] += second[i] == side
+        largest = sizes.argmax()
+        for i in range(len(second)):
+            if (
+                second[i] == side
+                and part[i] != largest
+                and sizes[part[i]] < min(least, sizes[largest] + side)
+            ):
+                second[i] = not side
 
 
 def best_merge(
-    known: Mapping[int, tuple[Evidence, Explanation]],
+    evidence: Mapping[int, Evidence],
+    plain: Mapping[int, Array | None],
+    explain_alone: Callable[[int], Explanation],
     changed: set[int],
+    gains: MutableMapping[Pair, float],
     apart: MutableMapping[Pair, int],
     *,
     distinct: Set[frozenset[int]] = frozenset(),
@@ -310,8 +330,11 @@ def best_merge(
     """Find the pair of objects that it pays most to merge: neighbours, or sides of one colour.
 
     Args:
-        known: Points of each object, by label, and their explanation as an object of its own.
+        evidence: Points of each object, by label.
+        plain: Its main plain colour (3,), if it has one.
+        explain_alone: Explains it as an object of its own.
         changed: Only pairs with one of these labels are considered.
+        gains: Pairs compared before, with how much it pays to merge them. Updated in place.
         apart: Pairs found to be two objects, with the number of points they had then; they are considered
             again when they have grown. Updated in place.
         distinct: Pairs known to be two objects, whatever their points suggest.
@@ -321,44 +344,45 @@ def best_merge(
     Returns:
         The larger object and the one merged into it, or None if no merge pays.
     """
-    labels, evidence = sorted(known), [known[k][0] for k in sorted(known)]
-    gaps = _gaps(evidence, config.explanation)
-    low, high = (np.array([f(e.points, axis=0) for e in evidence]).reshape(-1, 3) for f in (np.min, np.max))
+    labels, points = sorted(evidence), [evidence[k].points for k in sorted(evidence)]
+    gaps = _gaps(points, [plain[k] for k in labels], config.explanation)
+    low, high = (np.array([f(p, axis=0) for p in points]).reshape(-1, 3) for f in (np.min, np.max))
     between = np.maximum(np.maximum(low[:, None] - high, low - high[:, None]), 0.0)
     near = np.triu(np.linalg.norm(between, axis=-1) <= gaps, 1)
-    tree = cache(lambda k: cKDTree(evidence[k].points))
+    tree = cache(lambda k: cKDTree(points[k]))
     pairs = []
     for first, second in np.argwhere(near).tolist():
         a, b = labels[first], labels[second]
-        grown = len(evidence[first]) + len(evidence[second]) >= GROWTH * apart.get((a, b), 0)
-        if not grown or not {a, b} & changed or frozenset((a, b)) in distinct:
+        grown = len(points[first]) + len(points[second]) >= GROWTH * apart.get((a, b), 0)
+        known = not grown or (a, b) in gains
+        if known or not {a, b} & changed or frozenset((a, b)) in distinct:
             continue
         if tree(first).count_neighbors(tree(second), gaps[first, second]) > 0:
             pairs.append((a, b))
-    sizes = {k: len(known[k][0]) for k in labels}
-    best, most = None, 0.0
+    names = sorted({k for pair in pairs for k in pair})
+    alone = dict(zip(names, on_threads(lambda n: explain_alone(names[n]), len(names)), strict=True))
 
     def gain_of(number: int) -> float:
-        pair = pairs[number]
-        return compare([known[k] for k in pair], config, np.random.default_rng([seed, *pair])).gain
+        sides = [(evidence[k], alone[k]) for k in pairs[number]]
+        return compare(sides, config, np.random.default_rng([seed, *pairs[number]])).gain
 
-    gains = on_threads(gain_of, len(pairs))
-    for (a, b), gain in zip(pairs, gains, strict=True):
-        if gain <= 0.0:
-            apart[a, b] = sizes[a] + sizes[b]
-        elif gain > most:
-            best, most = ((a, b) if sizes[a] >= sizes[b] else (b, a)), gain
-    return best
+    gains.update(zip(pairs, on_threads(gain_of, len(pairs)), strict=True))
+    for a, b in [pair for pair, gain in gains.items() if gain <= 0.0]:
+        apart[a, b] = len(evidence[a]) + len(evidence[b])
+        del gains[a, b]
+    if not gains:
+        return None
+    a, b = max(sorted(gains), key=lambda pair: gains[pair])
+    return (a, b) if len(evidence[a]) >= len(evidence[b]) else (b, a)
 
 
-def _gaps(evidence: Sequence[Evidence], costs: ExplanationConfig) -> Array:
+def _gaps(points: Sequence[Array], plain: Sequence[Array | None], costs: ExplanationConfig) -> Array:
     """Maximum gap (N, N) [m] between parts of one object: the longer one's length if they share a colour.
 
     Sides of a plain colour so far off may be its own.
     """
-    length = np.array([np.linalg.norm(np.ptp(e.points, axis=0)) for e in evidence])
-    found = [None if e.rgb is None else plain_colour(e.rgb, costs)[1] for e in evidence]
-    colour = np.array([np.full(3, np.nan) if c is None else c for c in found]).reshape(-1, 3)
+    length = np.array([np.linalg.norm(np.ptp(p, axis=0)) for p in points])
+    colour = np.array([np.full(3, np.nan) if c is None else c for c in plain]).reshape(-1, 3)
     alike = np.linalg.norm(colour[:, None] - colour, axis=-1) <= PLAIN
     longer = np.maximum(np.maximum(length[:, None], length), costs.reach)
     return np.where(alike, longer, costs.reach)
@@ -395,7 +419,7 @@ def compare(
     both = first.joined(second)
     of_second = np.arange(len(both)) >= len(first)
     apart = alone.cost + other.cost
-    border = _border(both, of_second, _neighbours(both.points), config)
+    border = _border(both, of_second, _neighbours(cKDTree(both.points)), config)
     one = best_explanation([e.shape for e in (alone, other) if e.shape is not None], both, costs)
     for first_look in (True, False):
         one = min(one, explain(both, costs, config.fit, rng, first_look=first_look), key=lambda e: e.cost)
@@ -412,10 +436,10 @@ def compare(
     return found if compound.shape is None else replace(found, border=0.0, one=compound)
 
 
-def _neighbours(points: Array) -> Groups:
+def _neighbours(tree: cKDTree) -> Groups:
     """Indices (N, 8) of the points (N, 3) nearest to each, itself among them: 2 cm square of them."""
-    count = min(8, len(points))
-    return np.asarray(cKDTree(points).query(points, k=count)[1]).reshape(len(points), count)
+    count = min(8, tree.n)
+    return np.asarray(tree.query(tree.data, k=count)[1]).reshape(tree.n, count)
 
 
 def _border(evidence: Evidence, second: Mask, near: Groups, config: Config) -> float:

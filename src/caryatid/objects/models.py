@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import combinations, compress
 from typing import Any
 
@@ -32,7 +32,7 @@ from caryatid.objects.description_length import (
     explained,
     plain_colour,
 )
-from caryatid.objects.model_selection import GROWTH, best_merge, split
+from caryatid.objects.model_selection import GROWTH, Groups, best_merge, split
 from caryatid.objects.reasons import Reasons, explain_object, explain_pair
 from caryatid.objects.solids import as_solid
 from caryatid.runtime.parallel import on_threads
@@ -242,6 +242,7 @@ class ObjectModels:
         self._undivided: dict[int, int] = {}
         self._segments: list[tuple[cKDTree, NDArray[np.int32]]] = []
         self._owners: dict[int, tuple[Cloud, NDArray[np.int32]]] = {}
+        self._colours: dict[int, tuple[Cloud, Array | None]] = {}
         self._apart: dict[tuple[int, int], int] = {}
         self._distinct: set[frozenset[int]] = set()
 
@@ -345,13 +346,8 @@ class ObjectModels:
         if rgb is None:
             return None
 
-        @cache
-        def plain(name: int) -> Array | None:
-            colours = self.points.of(name, config.spacing).rgb
-            return None if colours is None else plain_colour(colours, config)[1]
-
         def differ(name: int, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-            colour = plain(name)
+            colour = self._plain_colour(name)
             if colour is None:
                 return np.zeros(len(rows), dtype=np.bool_)
             return colour_costs(rgb[rows], colour[None], config)[:, 0] >= config.outlier
@@ -434,20 +430,24 @@ class ObjectModels:
         Returns:
             The labels that changed.
         """
-        changed: set[int] = set()
-        noise = self._noise()
+        changed, noise, clouds = set[int](), self._noise(), dict[int, Cloud]()
         for label in sorted(labels & self.fits.keys()):
-            cloud = self.points.of(label)
-            if len(cloud) < GROWTH * self._undivided.get(label, 0):
-                continue
-            evidence, whole = self._explained(label, noise, voxels, sighted=True)
-            rng = np.random.default_rng([self._seed, label])
+            if len(cloud := self.points.of(label)) >= GROWTH * self._undivided.get(label, 0):
+                clouds[label] = cloud
+        tried = list(clouds)
+
+        def divided(number: int) -> Groups | None:
+            evidence, whole = self._explained(tried[number], noise, voxels, sighted=True)
+            rng = np.random.default_rng([self._seed, tried[number]])
             groups = split(evidence, whole, config=self._config, rng=rng)
+            points = clouds[tried[number]].points_world
+            return None if groups is None else groups[cKDTree(evidence.points).query(points)[1]]
+
+        for label, groups in zip(tried, on_threads(divided, len(tried)), strict=True):
             if groups is None:
-                self._undivided[label] = len(cloud)
+                self._undivided[label] = len(clouds[label])
             else:
-                _, nearest = cKDTree(evidence.points).query(cloud.points_world)
-                changed |= set(self.points.divide(label, groups[nearest]))
+                changed |= set(self.points.divide(label, groups))
         self._forget(changed)
         self.fit_all(changed, voxels)
         return changed
@@ -458,20 +458,27 @@ class ObjectModels:
         Returns:
             Label given up → label that takes its points.
         """
-        noise, given_up = self._noise(), dict[int, int]()
-        known = {k: self._explained(k, noise, voxels, compound=True) for k in sorted(self.fits)}
+        noise, given_up, gains = self._noise(), dict[int, int](), dict[tuple[int, int], float]()
+        evidence = {k: self._evidence(k, noise, voxels) for k in self.fits}
+        plain = {k: self._plain_colour(k) for k in self.fits}
+
+        def alone(label: int) -> Explanation:
+            return self._explained(label, noise, voxels, compound=True)[1]
+
         while pair := best_merge(
-            known, labels, self._apart, distinct=self._distinct, config=self._config, seed=self._seed
-        ):
+            evidence, plain, alone, labels, gains, self._apart,
+            distinct=self._distinct, config=self._config, seed=self._seed,
+        ):  # fmt: skip
             new, old = pair
             self.points.merge(old, new)
             self._distinct = {frozenset(new if k == old else k for k in two) for two in self._distinct}
             self._forget(set(pair))
             given_up = {k: new if v == old else v for k, v in given_up.items()} | {old: new}
-            del self.fits[old], known[old], known[new]
+            del self.fits[old], evidence[old], evidence[new]
             self.fit_all({new}, voxels)
             if new in self.fits:
-                known[new] = self._explained(new, noise, voxels, compound=True)
+                evidence[new], plain[new] = self._evidence(new, noise, voxels), self._plain_colour(new)
+            gains = {two: gain for two, gain in gains.items() if not {*pair} & {*two}}
             labels = labels | {new}
         return given_up
 
@@ -561,11 +568,7 @@ class ObjectModels:
 
         If asked, the evidence has the segments of all views.
         """
-        config = self._config.explanation
-        cloud = self.points.of(label, config.spacing)
-        weight = config.spacing**2 / config.reading
-        shown = self._shown(label, cloud) if sighted else None
-        evidence = Evidence(cloud.points_world, cloud.normals_world, weight, noise, voxels, cloud.rgb, shown)
+        config, evidence = self._config.explanation, self._evidence(label, noise, voxels, sighted=sighted)
         shape = self.fits[label].shape
         explanation = best_explanation([shape], evidence, config)
         if not compound or explained(explanation, evidence, config):
@@ -574,6 +577,24 @@ class ObjectModels:
             self._compounds[label] = best_compound(evidence, self._config, explanation.cost).shape
         known = self._compounds[label]
         return evidence, explanation if known is None else best_explanation([shape, known], evidence, config)
+
+    def _evidence(
+        self, label: int, noise: float, voxels: VoxelMap | None, *, sighted: bool = False
+    ) -> Evidence:
+        """Evidence of an object; if asked, with the segments of all views."""
+        config = self._config.explanation
+        cloud = self.points.of(label, config.spacing)
+        weight = config.spacing**2 / config.reading
+        shown = self._shown(label, cloud) if sighted else None
+        return Evidence(cloud.points_world, cloud.normals_world, weight, noise, voxels, cloud.rgb, shown)
+
+    def _plain_colour(self, label: int) -> Array | None:
+        """The main plain colour of an object, or None for a print."""
+        cloud = self.points.of(label, self._config.explanation.spacing)
+        if self._colours.get(label, (None,))[0] is not cloud:
+            colour = None if cloud.rgb is None else plain_colour(cloud.rgb, self._config.explanation)[1]
+            self._colours[label] = cloud, colour
+        return self._colours[label][1]
 
     def _shown(self, label: int, cloud: Cloud) -> NDArray[np.int32]:
         """Segment (V, N) on which each view shows the points of an object, 0 = none."""
@@ -592,6 +613,7 @@ class ObjectModels:
         self._undivided = {k: n for k, n in self._undivided.items() if k not in labels}
         self._apart = {pair: n for pair, n in self._apart.items() if not labels & set(pair)}
         self._owners = {k: known for k, known in self._owners.items() if k not in labels}
+        self._colours = {k: known for k, known in self._colours.items() if k not in labels}
         self._fitted = {k: known for k, known in self._fitted.items() if k not in labels}
 
     def _noise(self) -> float:

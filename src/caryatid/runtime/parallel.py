@@ -155,7 +155,7 @@ def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
 def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
     """Results of a task for each index from 0 to count − 1, on as many threads as numba uses.
 
-    A task calls kernels compiled with `nogil=True`, and must not call `on_threads` itself.
+    A task should call kernels compiled with `nogil=True`; it may call `on_threads` itself.
     """
     results: list[Any] = [None] * count
     indices = iter(range(count))
@@ -168,7 +168,8 @@ def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
     shares = [_threads(os.getpid()).submit(take_share) for _ in range(helpers)]
     take_share()
     for share in shares:
-        share.result()
+        if not share.cancel():  # a share that has not begun would find nothing left
+            share.result()
     return results
 
 

@@ -67,6 +67,11 @@ class VoxelMap:
         return self._known[0]
 
     @property
+    def space(self) -> tuple[NDArray[np.int8], Array, float]:
+        """States (X, Y, Z), the corner (3,) [m] and the size [m] of the voxels, for the compiled kernels."""
+        return self.states, self.origin_world, self.config.size
+
+    @property
     def occupied(self) -> NDArray[np.intp]:
         """Indices x, y, z (3, N) of the occupied voxels."""
         return self._known[1]
