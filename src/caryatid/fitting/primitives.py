@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.errors import InputError, check_type
@@ -117,7 +116,7 @@ def candidates(
 
     Arguments are as in `fit`. With `whole`, sides that should have been seen cost by their bare share.
     """
-    fits, judged_by = _ranked(points, normals, config, rng)
+    fits, judged_by = _ranked(*_finite(points, normals), config, rng)
     return sorted((_with_bare(f, judged_by) for f in fits), key=lambda f: f.cost) if whole else fits
 
 
@@ -206,14 +205,35 @@ def _ranked(
     points: Array, normals: Array, config: FitConfig, rng: np.random.Generator
 ) -> tuple[list[Fit], Array]:
     """The best fit of each shape, lowest cost first, and the points (N, 3) by which they are scored."""
-    kinds, rows, scores, seen, points = fit_each(points, normals, config, rng)
-    fits = [
-        Fit(as_shape(kind, row), residual, inliers, tuple(sides), cost)
-        for kind, row, (cost, residual, inliers), sides in zip(
-            kinds, rows, scores.tolist(), seen.tolist(), strict=True
-        )
-    ]
-    return fits, points
+    if len(points) < config.min_points:
+        return [], points
+    count = min(len(points), config.max_points)
+    every = max(1, count // config.search_points)
+    if every > 1 or count < len(points):
+        # Shuffled: points come row by row, and every n-th of a row would leave out whole columns.
+        drawn = rng.choice(len(points), count, replace=False)
+        points, normals = points[drawn], normals[drawn]
+    origin = points.mean(axis=0)
+    centred = points - origin
+    some, facing = centred[::every].copy(), normals[::every].copy()
+    kinds = [KINDS[kind] for kind in config.shapes]
+    samples = rng.integers(0, -(-count // every), size=(len(kinds), config.hypotheses, 2))
+    rows = len(kinds), config.polish + 2
+    shapes, score = np.empty((*rows, 5, 3)), np.full((*rows, 3), np.inf)
+    seen = np.empty((*rows, 6), dtype=np.bool_)
+    best = best_of_each(
+        np.array([kind.code for kind in kinds]), centred, normals, some, facing, samples, config.steps,
+        config.threshold, config.max_radius, config.max_extent, config.min_extent, config.normal_weight,
+        config.min_points, shapes, score, seen,
+    )  # fmt: skip
+    fits = []
+    for number, (kind, row) in enumerate(zip(kinds, best.tolist(), strict=True)):
+        if row >= 0:
+            shapes[number, row, 3] += origin
+            cost, residual, inliers = score[number, row].tolist()
+            sides = tuple(seen[number, row].tolist())
+            fits.append(Fit(as_shape(kind, shapes[number, row]), residual, inliers, sides, cost))
+    return sorted(fits, key=lambda f: f.cost), points
 
 
 def as_shape(kind: type[Shape], row: Array) -> Shape:
@@ -221,48 +241,8 @@ def as_shape(kind: type[Shape], row: Array) -> Shape:
     return kind.from_extents(transforms.rigid(row[:3], row[3]), 2.0 * row[4])
 
 
-def fit_each(
-    points: Array, normals: Array, config: FitConfig, rng: np.random.Generator
-) -> tuple[list[type[Shape]], Array, Array, NDArray[np.bool_], Array]:
-    """Fit each kind of shape.
-
-    Returns:
-        The kinds that fit, the one of the lowest cost first; their axes, centres and half extents (K, 5, 3);
-        cost, residual and share of inliers (K, 3); the sides that points confirm (K, 6); and the points
-        (N, 3) by which they are scored.
-    """
-    points, normals = _finite(points, normals)
-    kinds = [KINDS[kind] for kind in config.shapes]
-    shape = len(kinds), config.polish + 2
-    shapes, scores = np.empty((*shape, 5, 3)), np.full((*shape, 3), np.inf)
-    seen = np.empty((*shape, 6), dtype=np.bool_)
-    best, origin = np.full(len(kinds), -1), np.zeros(3)
-    if len(points) >= config.min_points:
-        count = min(len(points), config.max_points)
-        every = max(1, count // config.search_points)
-        if every > 1 or count < len(points):
-            # Shuffled: points come row by row, and every n-th of a row would leave out whole columns.
-            drawn = rng.choice(len(points), count, replace=False)
-            points, normals = points[drawn], normals[drawn]
-        origin = points.mean(axis=0)
-        centred = points - origin
-        some, facing = centred[::every].copy(), normals[::every].copy()
-        samples = rng.integers(0, -(-count // every), size=(len(kinds), config.hypotheses, 2))
-        best = _best_of_each(
-            np.array([kind.code for kind in kinds]), centred, normals, some, facing, samples, config.steps,
-            config.threshold, config.max_radius, config.max_extent, config.min_extent, config.normal_weight,
-            config.min_points, shapes, scores, seen,
-        )  # fmt: skip
-    found = np.flatnonzero(best >= 0)
-    found = found[np.argsort(scores[found, best[found], 0], kind="stable")]
-    which = found, best[found]
-    rows = shapes[which]
-    rows[:, 3] += origin
-    return [kinds[k] for k in found], rows, scores[which], seen[which], points
-
-
 @kernel
-def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
+def best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
     kinds, points, normals, some, facing, samples, steps, threshold, max_radius, max_extent, min_extent,
     normal_weight, min_points, shapes, score, seen,
 ):  # fmt: skip

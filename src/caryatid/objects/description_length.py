@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from caryatid.config import Config, ExplanationConfig, FitConfig
-from caryatid.fitting.primitives import as_shape, count_free, fit_each
+from caryatid.fitting.primitives import as_shape, best_of_each, count_free
 from caryatid.geometry import BOX
-from caryatid.geometry.shapes import Box, Shape
+from caryatid.geometry.shapes import KINDS, Box, Shape
+from caryatid.geometry.signed_distance import copy
 from caryatid.geometry.transforms import Array
 from caryatid.objects.compounds import (
     Compound,
@@ -24,7 +25,7 @@ from caryatid.objects.compounds import (
     revolutions,
     shape_costs,
 )
-from caryatid.runtime.parallel import kernel
+from caryatid.runtime.parallel import SHARES, for_each, kernel
 from caryatid.segmentation.segments import PLAIN, colour_shares
 from caryatid.sensing.voxel_map import VoxelMap
 
@@ -122,19 +123,22 @@ def colour_evidence(first: Evidence, second: Evidence, config: ExplanationConfig
     return both - alone - other
 
 
-def unity(evidence: Evidence, second: NDArray[np.bool_], config: ExplanationConfig) -> float:
-    """Evidence [nats] of views that points, and a second side (N,) of them, are one object; 0 if not.
+def unity(evidence: Evidence, seconds: NDArray[np.bool_], config: ExplanationConfig) -> Array:
+    """Evidence (S,) [nats] of views that points, and each of some second sides (S, N), are one object.
 
-    Each point of the side with fewer in a view speaks, by the share of the other side's on its segment.
+    Each point of the side with fewer in a view speaks, by the share of the other side's on its segment; it
+    is at least 0.
     """
-    points = 0.0
+    points = np.zeros(len(seconds))
     for own in () if evidence.segments is None else evidence.segments:
-        one, other = own[second & (own > 0)], own[~second & (own > 0)]
-        if len(one) and len(other):
-            counts = [np.bincount(side, minlength=int(own.max()) + 1) for side in (one, other)]
-            same = float(counts[0] @ counts[1]) / (len(one) * len(other))
-            points += (2.0 * same - 1.0) * min(len(one), len(other))
-    return config.sighted * evidence.weight * max(points, 0.0)
+        segments, index = np.unique(own, return_inverse=True)
+        on_segment = (index[:, None] == np.flatnonzero(segments)).astype(np.float64)
+        of_second = seconds @ on_segment
+        of_first = on_segment.sum(axis=0) - of_second
+        fewer = np.minimum(of_second.sum(axis=1), of_first.sum(axis=1))
+        both = np.maximum(of_second.sum(axis=1) * of_first.sum(axis=1), 1.0)
+        points += (2.0 * (of_first * of_second).sum(axis=1) / both - 1.0) * fewer
+    return config.sighted * evidence.weight * np.maximum(points, 0.0)
 
 
 def plain_colour(rgb: NDArray[np.uint8], config: ExplanationConfig) -> tuple[float, Array | None]:
@@ -225,30 +229,6 @@ def _count_free(kind, R, centre, half, noise, states, origin, size):  # type: ig
     return count_free(kind, R, centre, half - inset, states, origin, size)[1]
 
 
-@kernel
-def _cheapest(  # type: ignore[no-untyped-def]
-    kinds, rows, prices, points, normals, noise, weight, normal_weight, outlier, free_weight, below, states,
-    origin, size,
-):  # fmt: skip
-    """Find the cheapest of some shapes (K, 5, 3) below a limit [nats], as `best_explanation` does.
-
-    Returns:
-        Its number, or −1, and its cost [nats].
-    """
-    best = -1
-    for k in range(len(kinds)):
-        R, centre, half = rows[k, :3], rows[k, 3], rows[k, 4]
-        points_cost = point_costs_on(
-            kinds[k], R, centre, half, points, normals, noise, normal_weight, outlier
-        )
-        cost = points_cost.sum() * weight + prices[k]
-        if cost < below:
-            cost += free_weight * _count_free(kinds[k], R, centre, half, noise, states, origin, size)
-        if cost < below:
-            best, below = k, cost
-    return best, below
-
-
 def explain(
     evidence: Evidence,
     config: ExplanationConfig,
@@ -257,25 +237,104 @@ def explain(
     *,
     first_look: bool = False,
 ) -> Explanation:
-    """Find the shape that explains points at the lowest cost.
+    """Find the shape that explains points at the lowest cost; see `explain_sides`."""
+    whole = np.ones((1, len(evidence)), dtype=np.bool_)
+    return explain_sides(evidence, whole, config, fit_config, rng, first_look=first_look)[0]
+
+
+def explain_sides(
+    evidence: Evidence,
+    sides: NDArray[np.bool_],
+    config: ExplanationConfig,
+    fit_config: FitConfig,
+    rng: np.random.Generator,
+    *,
+    first_look: bool = False,
+) -> list[Explanation]:
+    """Find the shape that explains each of some sides of points at the lowest cost.
 
     Args:
         evidence: The points.
+        sides: Which points each side has (S, N).
         config: The costs of explanations.
         fit_config: Settings of the fits.
         rng: Source of the samples.
-        first_look: Make a quick fit, which only tells what is worth a full one.
+        first_look: Make quick fits, which only tell what is worth a full one.
     """
     settings = _quick(fit_config) if first_look else _thorough(fit_config)
-    kinds, rows, *_ = fit_each(evidence.points, evidence.normals, settings, rng)
-    best, cost = _cheapest(
-        np.array([kind.code for kind in kinds], dtype=np.intp), rows,
-        config.parameter_cost * np.array([float(kind.parameters) for kind in kinds]),
-        np.ascontiguousarray(evidence.points), np.ascontiguousarray(evidence.normals), evidence.noise,
-        evidence.weight, config.normal_weight, config.outlier, config.free_cost,
-        _cost(None, evidence, config), *(NOTHING_SEEN if evidence.voxels is None else evidence.voxels.space),
+    kinds = [KINDS[kind] for kind in settings.shapes]
+    best, shapes, costs = np.empty(len(sides), np.intp), np.empty((len(sides), 5, 3)), np.empty(len(sides))
+    data = (
+        np.ascontiguousarray(evidence.points), np.ascontiguousarray(evidence.normals), sides,
+        rng.permutation(len(evidence)), rng.random((len(sides), len(kinds), settings.hypotheses, 2)),
+        np.array([kind.code for kind in kinds]),
+        np.array([float(config.parameter_cost * kind.parameters) for kind in kinds]),
+        settings.polish, settings.steps, settings.max_points, settings.threshold, settings.max_radius,
+        settings.max_extent, settings.min_extent, settings.normal_weight, settings.min_points,
+        evidence.noise, evidence.weight, config.normal_weight, config.outlier, config.irregular,
+        price(None, config), config.free_cost,
+        *(NOTHING_SEEN if evidence.voxels is None else evidence.voxels.space), best, shapes, costs,
     )  # fmt: skip
-    return Explanation(as_shape(kinds[best], rows[best]) if best >= 0 else None, cost)
+    for_each(_explain_sides, min(SHARES, len(sides)), data)
+    return [
+        Explanation(as_shape(kinds[k], row) if k >= 0 else None, cost)
+        for k, row, cost in zip(best.tolist(), shapes, costs.tolist(), strict=True)
+    ]
+
+
+@kernel
+def _explain_sides(share, data):  # type: ignore[no-untyped-def]
+    """Write the cheapest shape of each side in a share: its kind, or −1 for none, its numbers, its cost."""
+    (
+        points, normals, sides, order, draws, kinds, prices, polish, steps, max_points, threshold, max_radius,
+        max_extent, min_extent, fit_normals, min_points, noise, weight, normal_weight, outlier, irregular,
+        irregular_price, free_cost, states, origin, size, best, found, costs,
+    ) = data  # fmt: skip
+    for side in range(share, len(sides), SHARES):
+        count = sides[side].sum()
+        own, facing = np.empty((count, 3)), np.empty((count, 3))
+        used, n = min(count, max_points), 0
+        some, some_normals, middle = np.empty((used, 3)), np.empty((used, 3)), np.zeros(3)
+        for i in order:
+            if sides[side, i]:
+                for a in range(3):
+                    own[n, a], facing[n, a] = points[i, a], normals[i, a]
+                    if n < used:
+                        some[n, a], some_normals[n, a] = points[i, a], normals[i, a]
+                        middle[a] += points[i, a] / used
+                n += 1
+        best[side], costs[side] = -1, irregular * count * weight + irregular_price
+        if count < min_points:
+            continue
+        for i in range(used):
+            for a in range(3):
+                some[i, a] -= middle[a]
+        samples = np.empty(draws.shape[1:], np.intp)
+        for k in range(len(kinds)):
+            for i in range(draws.shape[2]):
+                for j in range(2):
+                    samples[k, i, j] = int(draws[side, k, i, j] * used)
+        shapes = np.empty((len(kinds), polish + 2, 5, 3))
+        score = np.full((len(kinds), polish + 2, 3), np.inf)
+        seen = np.empty((len(kinds), polish + 2, 6), np.bool_)
+        rows = best_of_each(
+            kinds, some, some_normals, some, some_normals, samples, steps, threshold, max_radius, max_extent,
+            min_extent, fit_normals, min_points, shapes, score, seen,
+        )  # fmt: skip
+        for k in range(len(kinds)):
+            if rows[k] < 0:
+                continue
+            shape = shapes[k, rows[k]]
+            R, centre, half = shape[:3], shape[3], shape[4]
+            for a in range(3):
+                centre[a] += middle[a]
+            own_costs = point_costs_on(kinds[k], R, centre, half, own, facing, noise, normal_weight, outlier)
+            cost = own_costs.sum() * weight + prices[k]
+            if cost < costs[side]:  # space is not looked up in vain
+                cost += free_cost * _count_free(kinds[k], R, centre, half, noise, states, origin, size)
+            if cost < costs[side]:
+                best[side], costs[side] = k, cost
+                copy(shape, found[side])
 
 
 @cache

@@ -23,6 +23,7 @@ from caryatid.objects.description_length import (
     best_explanation,
     colour_evidence,
     explain,
+    explain_sides,
     explained,
     point_costs,
     price,
@@ -201,24 +202,15 @@ def _settled(
     Returns:
         The division each start converges to, by its index; none if one side is left with too few points.
     """
-
-    def explained_sides(quick: bool) -> list[tuple[int, tuple[Explanation, Explanation]]]:
-        """Explanations of both sides of each start that has enough points on both."""
-        least = config.split.min_points
-        known = [k for k, second in enumerate(seconds) if min(second.sum(), (~second).sum()) >= least]
-        sides = [side for k in known for side in (~seconds[k], seconds[k])]
-        rngs = rng.spawn(len(sides))
-
-        def side_explained(number: int) -> Explanation:
-            part = evidence.select(sides[number])
-            return explain(part, config.explanation, config.fit, rngs[number], first_look=quick)
-
-        found = on_threads(side_explained, len(sides))
-        return [(k, (found[2 * n], found[2 * n + 1])) for n, k in enumerate(known)]
-
-    seconds = list(starts)
-    for _ in range(0 if first_look else config.split.rounds):
-        for k, pair in explained_sides(quick=True):
+    seconds = np.array(starts, dtype=np.bool_).reshape(-1, len(evidence))
+    known, found = np.arange(len(seconds)), list[Explanation]()
+    for turn in range(0 if first_look else -config.split.rounds, 1):
+        counts = seconds[known].sum(axis=1)
+        known = known[np.minimum(counts, len(evidence) - counts) >= config.split.min_points]
+        sides = np.stack([~seconds[known], seconds[known]], axis=1).reshape(-1, len(evidence))
+        quick = first_look or turn < 0
+        found = explain_sides(evidence, sides, config.explanation, config.fit, rng, first_look=quick)
+        for k, *pair in zip(known.tolist() if turn < 0 else [], found[::2], found[1::2], strict=False):
             # To the shape that explains a point better, together with the points around it.
             cost = np.stack([point_costs(e.shape, evidence, config.explanation) for e in pair])
             if k < hinted and evidence.rgb is not None:
@@ -228,13 +220,14 @@ def _settled(
             cost = (cost + cost[:, near].mean(axis=2)) / 2.0
             seconds[k] = cost[1] < cost[0]
             _keep_connected(pairs, seconds[k])
+    borders = _borders(evidence, seconds[known], near, config)
+    others = unity(evidence, seconds[known], config.explanation)
     settled: dict[int, TwoObjects] = {}
-    for k, pair in explained_sides(first_look):
+    for n, k in enumerate(known.tolist()):
         gain = _colours(evidence, seconds[k], config.explanation) if k < hinted else 0.0
-        border = _border(evidence, seconds[k], near, config)
-        others = unity(evidence, seconds[k], config.explanation) - gain
         pays = gain > price(None, config.explanation)
-        settled[k] = TwoObjects(seconds[k], pair, border, others, pays)
+        sides_explained = found[2 * n], found[2 * n + 1]
+        settled[k] = TwoObjects(seconds[k], sides_explained, float(borders[n]), float(others[n]) - gain, pays)
     return settled
 
 
@@ -419,7 +412,7 @@ def compare(
     both = first.joined(second)
     of_second = np.arange(len(both)) >= len(first)
     apart = alone.cost + other.cost
-    border = _border(both, of_second, _neighbours(cKDTree(both.points)), config)
+    border = float(_borders(both, of_second[None], _neighbours(cKDTree(both.points)), config)[0])
     one = best_explanation([e.shape for e in (alone, other) if e.shape is not None], both, costs)
     for first_look in (True, False):
         one = min(one, explain(both, costs, config.fit, rng, first_look=first_look), key=lambda e: e.cost)
@@ -442,13 +435,16 @@ def _neighbours(tree: cKDTree) -> Groups:
     return np.asarray(tree.query(tree.data, k=count)[1]).reshape(tree.n, count)
 
 
-def _border(evidence: Evidence, second: Mask, near: Groups, config: Config) -> float:
-    """Cost [nats] of a border of two sides: where the surface continues without a concave crease."""
-    row, col = np.repeat(np.arange(len(second)), near.shape[1]), near.ravel()
-    across = second[row] != second[col]
-    row, col = row[across], col[across]
+def _borders(evidence: Evidence, seconds: Mask, near: Groups, config: Config) -> Array:
+    """Cost (S,) [nats] of the border of each of some second sides (S, N): where the surface continues.
+
+    It does without a concave crease.
+    """
+    row, col = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()
     between = evidence.points[col] - evidence.points[row]
     turn = evidence.normals[col] - evidence.normals[row]
     bend = np.einsum("ij,ij->i", turn, between) / np.maximum(np.linalg.norm(between, axis=1), 1e-9)
-    smooth = np.count_nonzero(bend > -np.sin(np.radians(config.segmentation.concavity)))
-    return config.explanation.border * smooth * evidence.weight / near.shape[1]
+    smooth = bend > -np.sin(np.radians(config.segmentation.concavity))
+    row, col = row[smooth], col[smooth]
+    number = np.count_nonzero(seconds[:, row] != seconds[:, col], axis=1)
+    return config.explanation.border * number * evidence.weight / near.shape[1]
