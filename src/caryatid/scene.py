@@ -737,8 +737,9 @@ class Scene(Pictured):
         self, observation: Observation, shown: set[int], voxels: VoxelMap, table: Array, given: bool
     ) -> Observation:
         """Fit the objects this view changed; split and merge automatic segments as the shapes suggest."""
-        shown = self._models.find_outdated(shown, voxels)
-        self._models.fit_all(shown, voxels)
+        kinds = self._models.find_outdated(shown, voxels)
+        self._models.fit_all(kinds, voxels, kinds)
+        shown = set(kinds)
         if self.identified:
             self._models.form(shown, voxels, table)
             return observation

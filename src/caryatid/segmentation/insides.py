@@ -52,15 +52,21 @@ def merge_insides(samples: Samples, part: Labels, floor: Mask, floor_size: float
     reach = max(2, round(RIM_WIDTH * samples.K[0, 0] / float(np.median(samples.points_camera[:, 2]))))
     top = _tops(samples, merged)
     alike, into = np.abs(top - top[:, None]) < RIM, np.arange(len(top))
+    image, spots = samples.image(merged), np.argwhere(samples.places)
+    order = np.argsort(merged, kind="stable")
+    rows = np.split(order, np.cumsum(np.bincount(merged))[:-1])
     for first, second in np.argwhere(np.triu(alike & _facing(samples, part), 1)):
         a, b = into[first], into[second]
-        both = (merged == a) | (merged == b)
-        points, normals = samples.points_camera[both], samples.normals_camera[both]
-        if a == b or hollowness(points, normals, np.zeros(len(points), dtype=np.intp))[0] <= HOLLOW:
+        if a == b:
             continue
-        image = samples.image(merged)
-        if _meet(image, a, b, reach) or _parted(samples, image, a, b):
-            merged[both], into[into == b] = a, a
+        both = np.concatenate([rows[a], rows[b]])
+        points, normals = samples.points_camera[both], samples.normals_camera[both]
+        if hollowness(points, normals, np.zeros(len(both), dtype=np.intp))[0] <= HOLLOW:
+            continue
+        middles = np.stack([samples.points_camera[rows[k]].mean(axis=0) for k in (a, b)])
+        if _meet(image, spots[rows[a]], a, b, reach) or _parted(samples, image, middles, a, b):
+            merged[both], into[into == b], rows[a] = a, a, both
+            image[tuple(spots[rows[b]].T)] = a
     look, top = hollowness(samples.points_camera, samples.normals_camera, merged), _tops(samples, merged)
     look[0] = 0.0
     for number in np.flatnonzero(look > HOLLOW).tolist():
@@ -103,21 +109,23 @@ def _facing(samples: Samples, part: Labels) -> Mask:
     return np.asarray(faces & faces.T)
 
 
-def _parted(samples: Samples, image: Labels, first: int, second: int) -> bool:
-    """Whether nothing but what is nearer lies between the middles of two parts of an image (H, W)."""
-    ends = np.stack([samples.points_camera[image[samples.places] == k].mean(axis=0) for k in (first, second)])
+def _parted(samples: Samples, image: Labels, ends: Array, first: int, second: int) -> bool:
+    """Whether nothing but what is nearer lies between two parts of an image (H, W), with middles (2, 3)."""
     pixels = (ends @ samples.K.T)[:, :2] / ends[:, 2:]
     steps = np.linspace(0.0, 1.0, 2 + int(np.abs(np.diff(pixels, axis=0)).max()))[:, None]
     column, row = np.rint(pixels[0] + steps * (pixels[1] - pixels[0])).astype(np.intp).T
     inverse_depth = (1.0 - steps[:, 0]) / ends[0, 2] + steps[:, 0] / ends[1, 2]
-    own = np.isin(image[row, column], (first, second))
+    between = image[row, column]
+    own = (between == first) | (between == second)
     return bool((own | (samples.depth[row, column] * inverse_depth < 1.0)).all())
 
 
-def _meet(image: Labels, first: int, second: int, reach: int) -> bool:
-    """Whether two parts of an image (H, W) lie within a reach of each other."""
-    rows, columns = (slice(max(0, own.start - reach), own.stop + reach) for own in _box(image == first))
-    image = image[rows, columns]
+def _meet(image: Labels, spots: NDArray[np.intp], first: int, second: int, reach: int) -> bool:
+    """Whether two parts of an image (H, W) lie within a reach of each other; the first is at spots (N, 2)."""
+    (top, left), (bottom, right) = np.maximum(spots.min(axis=0) - reach, 0), spots.max(axis=0) + reach + 1
+    image = image[top:bottom, left:right]
+    if not (image == second).any():
+        return False
     around = ndimage.binary_dilation(image == first, np.ones((3, 3)), iterations=reach)
     return int(np.count_nonzero(image[around] == second)) >= MEETING * reach
 

@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from caryatid.config import SegmentationConfig
 from caryatid.geometry import transforms
+from caryatid.geometry.points import quantile
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import kernel
 from caryatid.sensing.clouds import thin
@@ -330,7 +331,10 @@ def hollowness(points: Array, normals: Array, part: NDArray[np.integer]) -> Arra
     """
     sizes = np.maximum(np.bincount(part), 1)
     every = np.arange(len(sizes))
-    middles = np.stack([ndimage.median(x, part, every) for x in points.T], axis=-1)
+    if len(sizes) == 1:
+        middles = np.array([[quantile(x.copy(), 0.5) for x in points.T]])
+    else:
+        middles = np.stack([ndimage.median(x, part, every) for x in points.T], axis=-1)
     inwards = transforms.unit(middles[part] - points)
     return np.bincount(part, np.einsum("ij,ij->i", inwards, normals)) / sizes
 

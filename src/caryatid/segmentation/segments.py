@@ -239,19 +239,20 @@ def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: float) -> La
     sizes, part_of = np.bincount(patch.ravel()), np.zeros(int(patch.max()) + 1, dtype=np.int32)
     part_of[patch] = labels
     sizes[0] = 0
-    for part in range(1, int(labels.max(initial=0)) + 1):
+    for part, box in enumerate(ndimage.find_objects(labels), 1):
         pieces = np.flatnonzero((part_of == part) & (sizes >= min_size))
         if len(pieces) < 2 or sizes[pieces].sum() < 0.9 * sizes[part_of == part].sum():
             continue
-        colours = {k: shares[patch == k] for k in pieces.tolist()}
+        own, own_patch = labels[box] == part, patch[box]
+        colours = {k: shares[box][own_patch == k] for k in pieces.tolist()}
         if max(np.sqrt(colour.var(axis=0).sum()) for colour in colours.values()) > PLAIN:
             continue
-        loose = ~np.isin(patch, pieces)
+        loose = ~np.isin(own_patch, pieces)
         nearest = ndimage.distance_transform_edt(loose, return_distances=False, return_indices=True)
-        piece_of = np.where(labels == part, patch[tuple(nearest)], -1)
+        piece_of = np.where(own, own_patch[tuple(nearest)], -1)
         if _borders_are_clean(piece_of, {k: c.mean(axis=0) for k, c in colours.items()}):
             for piece in pieces[1:]:
-                result[piece_of == piece] = result.max() + 1
+                result[box][piece_of == piece] = result.max() + 1
     return result
 
 
