@@ -208,7 +208,7 @@ def _ranked(
     if len(points) < config.min_points:
         return [], points
     count = min(len(points), config.max_points)
-    every = max(1, -(-count // config.search_points))
+    every = max(1, count // config.search_points)
     if every > 1 or count < len(points):
         # Shuffled: points come row by row, and every n-th of a row would leave out whole columns.
         drawn = rng.choice(len(points), count, replace=False)
