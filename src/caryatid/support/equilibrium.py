@@ -71,30 +71,34 @@ def support_forces(
         rng: Source of the draws.
     """
     scene, count = Equilibrium(objects, config), len(objects)
-    at_rest, moving = np.zeros((2, count, count))
-    forces, total = np.zeros((count, count, 3)), np.zeros(count)
-    alike, needed = np.zeros(count), np.ones((count, count), dtype=np.bool_)
-    visible = np.where(scene.explained, 1.0, 1.0 - config.unexplained)
+    pressing, pressed = scene.pairs.T
+    at_rest, moving = np.zeros((2, len(scene.pairs)))
+    forces, total, alike = np.zeros((len(scene.pairs), 3)), np.zeros(count), np.zeros(count)
+    needed = np.ones(len(scene.pairs), dtype=np.bool_)
     for number, draw in enumerate(scene.draws(rng)):
         balance = scene.solve(draw)
         rests = balance.motion <= config.at_rest
         trust = np.where(rests, 1.0, config.unexplained)
-        carries = balance.pushes[..., 2] > config.force_share
-        presses = (np.linalg.norm(balance.pushes, axis=-1) > config.force_share) & ~carries & needed
-        fell = np.zeros((count, count), dtype=np.bool_)
-        for group in scene.independent(np.flatnonzero(presses.any(axis=1) & ~scene.fixed)):
-            motion = scene.solve(draw, without=group).motion
-            fell[group] = presses[group] & (motion > balance.motion + config.at_rest)
+        carries = balance.pushes[:, 2] > config.force_share
+        presses = (np.linalg.norm(balance.pushes, axis=1) > config.force_share) & ~carries & needed
+        fell = np.zeros(len(scene.pairs), dtype=np.bool_)
+        for group in scene.independent(np.unique(pressing[presses & ~scene.fixed[pressing]])):
+            faster = scene.solve(draw, without=group).motion > balance.motion + config.at_rest
+            fell |= presses & np.isin(pressing, group) & faster[pressed]
         if number == 0:
             needed = fell
-        at_rest += (carries | fell) & rests
-        moving += (carries & ~rests) * config.unexplained
-        forces += balance.pushes * trust[:, None]
+        at_rest += (carries | fell) & rests[pressed]
+        moving += (carries & ~rests[pressed]) * config.unexplained
+        forces += balance.pushes * trust[pressed, None]
         total += trust
         alike += draw.likeness >= 0.5
     # Divided before they are weighted: rounding must not exceed the weight.
-    shares = (visible * (at_rest / total) + (1.0 - config.unexplained) * (moving / total)).clip(0.0, 1.0)
-    return SupportForces(shares, forces / total[:, None], alike / config.draws, scene.contacts, scene.areas)
+    seen, hidden = at_rest / total[pressed], moving / total[pressed]
+    visible = np.where(scene.explained, 1.0, 1.0 - config.unexplained)
+    shares, means = np.zeros((count, count)), np.zeros((count, count, 3))
+    shares[pressing, pressed] = (visible * seen + (1.0 - config.unexplained) * hidden).clip(0.0, 1.0)
+    means[pressing, pressed] = forces / total[pressed, None]
+    return SupportForces(shares, means, alike / config.draws, scene.contacts, scene.areas)
 
 
 def moved_without(
@@ -118,13 +122,17 @@ def moved_without(
         The probabilities, and how much a draw counts for each object (D, N) [1].
     """
     scene, moves, trusts = Equilibrium(objects, config), [], []
-    held, visible = np.zeros(len(objects)), np.where(scene.explained, 1.0, 1.0 - config.unexplained)[index]
+    own, held = np.flatnonzero(scene.pairs[:, 0] == index), np.zeros(len(objects))
+    others, visible = scene.pairs[own, 1], np.full(len(objects), 1.0 - config.unexplained)
+    visible[others[scene.explained[own]]] = 1.0
     for draw in scene.draws(rng):
         balance, after = scene.solve(draw), scene.solve(draw, without=[index]).motion
         rests = balance.motion <= config.at_rest
         trust, sure = np.where(rests, 1.0, config.unexplained), np.where(rests, 1.0, 1.0 - config.unexplained)
         fell = after > balance.motion + config.at_rest
-        held += ((balance.pushes[index, :, 2] > config.force_share) | fell) * sure * trust
+        holds = fell.copy()
+        holds[others] |= balance.pushes[own, 2] > config.force_share
+        held += holds * sure * trust
         moves.append(fell * sure)
         trusts.append(trust)
     counts = np.array(trusts)
@@ -159,7 +167,8 @@ class Balance:
 
     Attributes:
         motion: Acceleration (N,) of each object's centre, or of its rim if that is more [g]; 0 at rest.
-        pushes: Force (N, N, 3) of each object on each other one, in weights of the latter [1], world frame.
+        pushes: Force (P, 3) of the first on the second of each pair, in the world frame, in weights of the
+            latter [1].
         pressed: Which contacts (K,) carry a force.
     """
 
@@ -214,8 +223,9 @@ class Equilibrium:
     Attributes:
         contacts: K contacts.
         areas: Corners (M, 3) [m] of each contact's area.
+        pairs: Pairs (P, 2) of objects with contacts, in both orders.
         fixed: Which objects (N,) do not move.
-        explained: For which pairs (N, N) some draw may close the nearest gap or overlap.
+        explained: For which pairs (P,) some draw may close the nearest gap or overlap.
     """
 
     def __init__(self, objects: Sequence[SceneObject], config: SupportConfig) -> None:
@@ -242,10 +252,12 @@ class Equilibrium:
         self._gaps = np.array([c.distance for c in self.contacts])
         scatter = np.einsum("kpv,kpv->k", self._rows**2, self._sigma[self._pairs] ** 2) + config.touch**2
         self._spread = np.sqrt(scatter)
-        self.explained = np.zeros((count, count), dtype=np.bool_)
+        ways = np.concatenate([self._pairs, self._pairs[:, ::-1]])
+        self.pairs, number = np.unique(ways, axis=0, return_inverse=True)
+        self._numbers = number.reshape(2, -1)
+        self.explained = np.zeros(len(self.pairs), dtype=np.bool_)
         for k in np.argsort(-self._gaps, kind="stable"):  # The smallest gap of a pair counts.
-            (a, b), near = self._pairs[k], abs(self._gaps[k]) <= _SIGMAS * self._spread[k]
-            self.explained[a, b] = self.explained[b, a] = near
+            self.explained[self._numbers[:, k]] = abs(self._gaps[k]) <= _SIGMAS * self._spread[k]
         self._points = np.concatenate([np.empty((0, 3)), *self.areas])
         self._contact = np.repeat(np.arange(len(self.areas)), [len(area) for area in self.areas])
         self._model = _engine(max(16, 1 << (len(objects) - 1).bit_length()), threading.get_ident())
@@ -258,8 +270,13 @@ class Equilibrium:
 
     def _falling(self) -> NDArray[np.intp]:
         """Objects (M,) that nothing carries in the estimated scene, by index."""
-        pushes = self.solve(next(self.draws(np.random.default_rng(0)))).pushes
-        return np.flatnonzero((pushes[..., 2].sum(axis=0) <= self._config.force_share) & ~self.fixed)
+        balance = self.solve(next(self.draws(np.random.default_rng(0))))
+        return np.flatnonzero(self._uncarried(balance))
+
+    def _uncarried(self, balance: Balance) -> NDArray[np.bool_]:
+        """Which objects (N,) may fall: nothing carries them."""
+        upwards = np.bincount(self.pairs[:, 1], balance.pushes[:, 2], len(self._objects))
+        return (upwards <= self._config.force_share) & ~self.fixed
 
     def draws(self, rng: np.random.Generator) -> Iterator[Draw]:
         """Draw scenes: first the estimated one, then others as likely.
@@ -314,8 +331,7 @@ class Equilibrium:
         hidden gaps (K,) [m] let them meet first.
         """
         far = draw.gaps > self._config.reach
-        upwards = self.solve(replace(draw, gaps=np.where(far, np.inf, hidden))).pushes[..., 2].sum(axis=0)
-        loose = (upwards <= self._config.force_share) & ~self.fixed
+        loose = self._uncarried(self.solve(replace(draw, gaps=np.where(far, np.inf, hidden))))
         far &= ~loose[self._pairs].any(axis=1)
         pressed = self.solve(replace(draw, gaps=np.where(far, np.inf, hidden))).pressed
         return far, pressed & (draw.gaps > self._config.at_rest * self._fall)
@@ -351,7 +367,7 @@ class Equilibrium:
         turning = np.linalg.norm(acceleration[:, 3:], axis=1) * self._reach
         motion = np.maximum(np.linalg.norm(acceleration[:, :3], axis=1), turning) / _GRAVITY
         motion[self.fixed] = 0.0
-        pushes, pressed = np.zeros((count, count, 3)), np.zeros(len(self.contacts), dtype=np.bool_)
+        pushes, pressed = np.zeros((len(self.pairs), 3)), np.zeros(len(self.contacts), dtype=np.bool_)
         if len(gone):
             active = np.flatnonzero(~gone & (data.contact.efc_address >= 0))
             frames = data.contact.frame.reshape(-1, 3, 3)[active]
@@ -359,10 +375,11 @@ class Equilibrium:
             forces = data.efc_force.take(rows, mode="clip") * (np.arange(3) < data.contact.dim[active, None])
             forces_world = np.einsum("ki,kij->kj", forces, frames)
             pressed[self._contact[active[forces[:, 0] > 0.0]]] = True
-            a, b = self._pairs[self._contact[active]].T
-            np.add.at(pushes, (a, b), forces_world)
-            np.add.at(pushes, (b, a), -forces_world)
-        return Balance(motion, pushes / (_GRAVITY * draw.densities * self._volumes)[:, None], pressed)
+            forth, back = self._numbers[:, self._contact[active]]
+            np.add.at(pushes, forth, forces_world)
+            np.add.at(pushes, back, -forces_world)
+        weights = (_GRAVITY * draw.densities * self._volumes)[self.pairs[:, 1], None]
+        return Balance(motion, pushes / weights, pressed)
 
     def _set(self, draw: Draw) -> None:
         """Set masses and positions of the model's bodies to the draw's."""

@@ -152,7 +152,8 @@ def closing(pairs: NDArray[np.intp], rows: Array, variance: Array, gaps: Array, 
     weighted = rows * variance[pairs]
     ends, each = pairs.ravel(), (2 * len(pairs), rows.shape[-1])
     shared = np.where(ends[:, None] == ends, weighted.reshape(each) @ rows.reshape(each).T, 0.0)
-    scatter = shared.reshape(len(pairs), 2, len(pairs), 2).sum(axis=(1, 3)) + noise * np.eye(len(pairs))
+    of_either = shared[::2] + shared[1::2]
+    scatter = of_either[:, ::2] + of_either[:, 1::2] + noise * np.eye(len(pairs))
     solved = np.linalg.solve(scatter, gaps)
     change = np.zeros(variance.shape)
     np.add.at(change, pairs, weighted * solved[:, None, None])
