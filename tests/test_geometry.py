@@ -13,7 +13,7 @@ from caryatid.errors import InputError
 from caryatid.evaluation.scores import as_scene, score
 from caryatid.exports import export_graph
 from caryatid.geometry import transforms
-from caryatid.geometry.polygons import area, cap, hull, intersection, signed_distance
+from caryatid.geometry.polygons import area, cap, fill, hull, intersection, signed_distance
 from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import (
     Box,
@@ -212,6 +212,19 @@ def test_the_intersection_is_the_one_of_shapely():
                     assert shapely.Polygon(common).symmetric_difference(expected).area < 1e-9
         for nothing in (SQUARE[:0], SQUARE[:1], SQUARE[:2]):
             assert area(intersection(a, nothing)) == area(intersection(nothing, a)) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_squares_in_a_polygon_are_those_of_shapely(seed):
+    rng = np.random.default_rng(seed)
+    for _ in range(100):
+        corners = hull(rng.integers(0, 30, (rng.integers(3, 12), 2)).astype(np.float64))
+        if len(corners) < 3:
+            continue
+        squares, places = np.zeros((30, 30), dtype=np.bool_), np.indices((30, 30))
+        fill(corners, squares)
+        inside = shapely.contains_xy(shapely.Polygon(corners), *places.reshape(2, -1).astype(np.float64))
+        np.testing.assert_array_equal(squares.ravel(), inside)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -23,6 +23,13 @@ def test_threads_are_those_that_are_asked_for(monkeypatch):
     parallel.cores.cache_clear()
 
 
+def test_work_that_is_shared_out_may_share_out_work():
+    def rows(number):
+        return sum(parallel.on_threads(lambda k: 10 * number + k, 10))
+
+    assert parallel.on_threads(rows, 20) == [sum(range(10 * n, 10 * n + 10)) for n in range(20)]
+
+
 OVERLAPPING = """
 import sys
 from threading import Event, Thread

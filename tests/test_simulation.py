@@ -266,6 +266,19 @@ def test_boards_over_an_edge_stand_only_with_their_weight(seed: int):
     assert lifting.lift(poses_of(scene), board + 1, LiftConfig()).disturbed[board]
 
 
+@pytest.mark.parametrize("name", ["tower", "bridge", "pile-6-2", "dense-10-4"])
+def test_a_lift_that_ends_early_disturbs_the_same(name: str):
+    scene = load_scene(name)
+    lifting = Lifting(scene.spec, list(scene.object_bodies.values()))
+    for index in range(len(scene.object_bodies)):
+        whole, short = (
+            lifting.lift(poses_of(scene), index, LiftConfig(), to_the_end=end).disturbed
+            for end in (True, False)
+        )
+        assert short.any() == whole.any()
+        assert not (short & ~whole).any()
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2, 4, 8, 11, 25])
 def test_storeys_carry_objects_on_every_level(seed: int):
     scene = generate("storeys", 6, seed)

@@ -31,6 +31,7 @@ from caryatid.objects.fusion import (
 )
 from caryatid.scene import Scene
 from caryatid.segmentation.observation import Observation
+from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.support.equilibrium import touching
@@ -87,9 +88,9 @@ class ViewScene(PaperScene):
     def _find_appeared(self, observation: Observation, voxels: VoxelMap) -> dict[int, str]:
         return super()._find_appeared(observation, voxels) if self.identified else {}
 
-    def _mapped(self, observation: Observation) -> VoxelMap:
+    def _mapped(self, observation: Observation, carrying: Sequence[SupportSurface]) -> VoxelMap:
         """Add the view to the map; return one of this view alone."""
-        super()._mapped(observation)
+        super()._mapped(observation, carrying)
         assert self.sphere is not None
         voxels = VoxelMap.around(self.sphere.centre_world, self.config.voxels)
         if observation.view is not None:

@@ -561,10 +561,10 @@ class Scene(Pictured):
             self._check_identity(observation, source.name)
         shown = self._models.add(observation, self.views, masked=given) | moved
         self.surfaces = self._fused_surfaces(observation)
-        voxels = self._mapped(observation)
+        carrying = self._carrying(observation)
+        below = voxels = self._mapped(observation, carrying)
         watch.lap("map")
-        below = voxels
-        for surface in self._carrying(observation):
+        for surface in carrying:
             lowest = surface.point_world[2] <= voxels.origin_world[2] + self.config.voxels.below
             depth = np.inf if lowest else float(surface.shape.extents[2])
             below = below.closed_below(surface.outline_world, surface.normal_world, depth)
@@ -721,13 +721,13 @@ class Scene(Pictured):
         numbers = {0, *known, *find_surface_below(self.surfaces, points).tolist()}
         return [self.surfaces[k] for k in sorted(numbers) if k < len(self.surfaces)]
 
-    def _mapped(self, observation: Observation) -> VoxelMap:
+    def _mapped(self, observation: Observation, carrying: Sequence[SupportSurface]) -> VoxelMap:
         """Add the view to the map, which reaches below all surfaces that carry something."""
         if self.sphere is None or self.voxels is None:
             centre = observation.surface.point_world
             self.sphere = ViewSphere.around(centre, self.config.active)
             self.voxels = VoxelMap.around(centre, self.config.voxels)
-        lowest = min(float(surface.point_world[2]) for surface in self._carrying(observation))
+        lowest = min(float(surface.point_world[2]) for surface in carrying)
         self.voxels = self.voxels.lowered(lowest - self.config.voxels.below)
         if observation.view is not None:
             self.voxels = self.voxels.integrate(observation.view, self.config.cloud.max_depth)

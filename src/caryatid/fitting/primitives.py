@@ -23,6 +23,10 @@ from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 FREE_WEIGHT = 0.01
 """Cost of a shape whose whole inside was seen free [m]; in proportion for a share of it."""
+ALONG = 0.7
+"""Cosine of the angle to a side up to which the gradient at a point confirms the side [1]: 45°."""
+CONFIRMED = 0.02
+"""Share of the points that must confirm a side [1]."""
 BARE_SPACING = 0.008
 """Spacing of the samples on a side that count points near it [m]; a point within twice that is near one."""
 
@@ -266,7 +270,7 @@ def best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
     polish = shapes.shape[1] - 2
     best, found = np.zeros(len(kinds), np.intp), np.zeros(len(kinds), np.intp)
     within = np.zeros(len(kinds), np.bool_)
-    least_seen = max(min_points / 3.0, 0.02 * len(points))  # Points that confirm a side.
+    least_seen = max(min_points / 3.0, CONFIRMED * len(points))  # Points that confirm a side.
     for turn in range(4):
         least = np.inf
         for k in range(len(kinds)):
@@ -335,8 +339,7 @@ def _judge(kind, shape, points, normals, threshold, least, min_extent, seen):  #
         count += 1
         if gx * facing[i, 0] + gy * facing[i, 1] + gz * facing[i, 2] > 0.5:
             for axis, g in enumerate((gx, gy, gz)):
-                # A point confirms the side whose direction its gradient follows within 45°.
-                counts[2 * axis + (g > 0.0)] += abs(g) > 0.7
+                counts[2 * axis + (g > 0.0)] += abs(g) > ALONG
     for side in range(6):
         seen[side] = counts[side] >= least
     if kind != SPHERE:

@@ -56,7 +56,7 @@ def complete(
     for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
         lower = tops < tops[k]
         done[k] = _extend_downwards(done[k], every, others[k], lower, surfaces[below[k]], voxels, config)
-        every = every.changed(k, done[k].shape)
+        every.put(k, done[k].shape)
     return done
 
 
@@ -72,11 +72,10 @@ class _Balls(NamedTuple):
         arrays = Primitives.of(shapes)
         return cls(shapes, arrays.centres, np.linalg.norm(arrays.half, axis=1))
 
-    def changed(self, k: int, shape: Shape) -> _Balls:
+    def put(self, k: int, shape: Shape) -> None:
         """Put another shape in the place of one."""
         self.shapes[k], self.centres[k] = shape, shape.T_world_object[:3, 3]
         self.radii[k] = np.linalg.norm(shape.extents) / 2.0
-        return self
 
 
 def _raise_upper_side(

@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from caryatid.config import Config, SegmentationConfig, ShapeKind
-from caryatid.fitting.primitives import Fit, FitFailure, fit, free_inside
+from caryatid.fitting.primitives import ALONG, CONFIRMED, Fit, FitFailure, fit, free_inside
 from caryatid.geometry import transforms
 from caryatid.geometry.points import last_in_voxels, most_central, rotate, transform
 from caryatid.geometry.shapes import Primitives, Shape
@@ -245,6 +245,7 @@ class ObjectModels:
         self._colours: dict[int, tuple[Cloud, Array | None]] = {}
         self._apart: dict[tuple[int, int], int] = {}
         self._distinct: set[frozenset[int]] = set()
+        self._table: tuple[Cloud | None, float] = None, 0.0
 
     def copy(self) -> ObjectModels:
         """Return an independent copy; clouds, trees and shapes are shared."""
@@ -400,8 +401,8 @@ class ObjectModels:
             else:
                 costs = shape_costs(o.shape, points, normals, sigma, config.explanation)
             facing = normals @ o.shape.T_world_object[:3, :3]
-            sides = np.count_nonzero(np.stack([-facing, facing], axis=2) > 0.7, axis=0).ravel()
-            new_mask = (sides >= max(config.fit.min_points, 0.02 * len(points))) & ~np.array(o.seen)
+            sides = np.count_nonzero(np.stack([-facing, facing], axis=2) > ALONG, axis=0).ravel()
+            new_mask = (sides >= max(config.fit.min_points, CONFIRMED * len(points))) & ~np.array(o.seen)
             count, free = self._fitted.get(label, (0, 0))
             if (
                 costs.mean() > config.explanation.usual
@@ -634,13 +635,15 @@ class ObjectModels:
 
         Primitives alone do not tell: with more noise, fewer objects are primitives.
         """
-        config, points = self._config, self.points.of(SUPPORT_LABEL, self._config.explanation.spacing)
-        places = points.points_world - points.points_world.mean(axis=0) if len(points) else np.zeros((1, 3))
-        table = np.abs(places @ np.linalg.eigh(places.T @ places)[1][:, 0])
+        config, table = self._config, self.points.of(SUPPORT_LABEL, self._config.explanation.spacing)
+        if self._table[0] is not table:
+            points = table.points_world - table.points_world.mean(axis=0) if len(table) else np.zeros((1, 3))
+            distances = np.abs(points @ np.linalg.eigh(points.T @ points)[1][:, 0])
+            self._table = table, 1.48 * float(np.median(distances))
         # 1.48 median or 1.25 mean absolute values of a normal distribution are one standard deviation.
         residuals = [o.residual for k, o in self.fits.items() if k not in self._solids]
         primitives = 1.25 * float(np.median(residuals)) if residuals else 0.0
-        return max(1.48 * float(np.median(table)), primitives, config.fit.registration)
+        return max(self._table[1], primitives, config.fit.registration)
 
     def _fit(
         self,
