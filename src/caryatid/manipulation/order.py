@@ -177,25 +177,26 @@ def _on_the_way(goal: str, rehearsal: _Rehearsal) -> list[str]:
 def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_Trial | None, list[_Trial]]:
     """The first safe lift, with one hand before two, or else the least risky; and those tried before.
 
-    None if no object can be grasped.
+    What the graph alone says is not safe is only rehearsed where it may be the least risky. None if no
+    object can be grasped.
     """
     tried: list[_Trial] = []
     for object_id in wanted:
         if isinstance(rehearsal.grasp(object_id), Blocked):
             continue
-        trial = rehearsal.try_lift(object_id)
+        trial = rehearsal.try_lift(object_id, bounded=True)
         if trial.risk <= rehearsal.accepted:
             return trial, tried
         tried.append(trial)
     if not tried:
         return None, tried
-    tried.sort(key=lambda t: (t.risk, len(t.harmed)))
-    best = tried[0]
+    while not (best := min(tried, key=lambda t: (t.risk, len(t.harmed)))).rehearsed:
+        tried[tried.index(best)] = rehearsal.try_lift(best.object_id)
     # The other hand holds one of those that were disturbed, the most often first.
     holds = ((t.object_id, held) for t in tried for held in sorted(t.harmed, key=lambda i: (-t.harmed[i], i)))
     for object_id, held in holds if hands > 1 else ():
-        trial = rehearsal.try_lift(object_id, [held])
-        if trial.risk < best.risk:
+        trial = rehearsal.try_lift(object_id, [held], bounded=True)
+        if trial.risk < best.risk and (trial := rehearsal.try_lift(object_id, [held])).risk < best.risk:
             best = trial
         if best.risk <= rehearsal.accepted:
             break
@@ -204,7 +205,7 @@ def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_
 
 def _step(rehearsal: _Rehearsal, trial: _Trial, left: Sequence[str]) -> TakeStep:
     with_hold = f" with {', '.join(trial.hold)} held" if trial.hold else ""
-    worst = ", ".join(f"{i} with probability {share:.2f}" for i, share in trial.rehearsed.items())
+    worst = ", ".join(f"{i} with probability {share:.2f}" for i, share in trial.disturbed.items())
     why = f"disturbed {worst or 'nothing'} in {len(trial.harm)} rehearsals{with_hold}"
     if trial.moved:
         moved = ", ".join(f"{i} with probability {share:.2f}" for i, share in trial.moved.items())
@@ -253,8 +254,8 @@ class _Trial:
         hold: What is held.
         harm: Probability (n,) that each rehearsal disturbed another object.
         doubt: Probability that an object moves by the graph.
-        risk: Probability that the next lift disturbs another object.
-        rehearsed: Share of the rehearsals that disturbed each object, by id.
+        risk: Probability that the next lift disturbs another object; at least that, before rehearsals.
+        disturbed: Share of the rehearsals that disturbed each object, by id.
         moved: Probability that each object moves by the graph, by id.
     """
 
@@ -263,14 +264,19 @@ class _Trial:
     harm: Array
     doubt: float
     risk: float
-    rehearsed: dict[str, float]
+    disturbed: dict[str, float]
     moved: dict[str, float]
+
+    @property
+    def rehearsed(self) -> bool:
+        """Whether it was rehearsed: without, the risk is what the graph says at least."""
+        return len(self.harm) > 0
 
     @property
     def harmed(self) -> dict[str, float]:
         """Probability that each object moves, by id, by the witness that says more."""
-        ids = dict.fromkeys([*self.rehearsed, *self.moved])
-        return {i: max(self.rehearsed.get(i, 0.0), self.moved.get(i, 0.0)) for i in ids}
+        ids = dict.fromkeys([*self.disturbed, *self.moved])
+        return {i: max(self.disturbed.get(i, 0.0), self.moved.get(i, 0.0)) for i in ids}
 
 
 class _Rehearsal:
@@ -343,11 +349,15 @@ class _Rehearsal:
             unstable |= zip(self._near(group), np.mean(found, axis=0).tolist(), strict=True)
         return unstable
 
-    def try_lift(self, object_id: str, hold: Collection[str] = ()) -> _Trial:
-        """Lift an object while others are held, in as many scenes as needed; cached, and nothing changes."""
+    def try_lift(self, object_id: str, hold: Collection[str] = (), *, bounded: bool = False) -> _Trial:
+        """Lift an object while others are held, in as many scenes as needed; cached, and nothing changes.
+
+        If bounded, a lift that is not safe by the graph alone is not rehearsed.
+        """
         asked = (object_id, *sorted(hold))
-        if asked not in self._trials:
-            self._trials[asked] = self._tried(object_id, tuple(hold))
+        known = self._trials.get(asked)
+        if known is None or not (known.rehearsed or bounded):
+            self._trials[asked] = self._tried(object_id, tuple(hold), bounded)
         return self._trials[asked]
 
     def grasp(self, object_id: str) -> Grasp | Blocked | None:
@@ -363,7 +373,7 @@ class _Rehearsal:
             self._grasps[object_id] = find_grasp(shape, others, gripper, friction, **known)
         return self._grasps[object_id]
 
-    def _tried(self, object_id: str, hold: tuple[str, ...]) -> _Trial:
+    def _tried(self, object_id: str, hold: tuple[str, ...], bounded: bool) -> _Trial:
         # An object held in a scene because it does not stay there moves if it loses a support.
         free = set(self.left()) - set(hold)
         group = self._group_of(object_id)
@@ -378,8 +388,10 @@ class _Rehearsal:
         moved = {e.object_id: e.probability for e in effects if e.object_id in free}
         doubt = max(moved.values(), default=0.0)  # What falls, falls together.
         accepted, most = self.accepted, self._config.rehearsal.draws
-        found, harm, risk, least = list[Array](), np.zeros(0), 1.0, 0.0
-        while not found or (len(found) < most and risk > accepted >= least):
+        found, harm = list[Array](), np.zeros(0)
+        risk = least = self._risk(np.zeros(most), doubt)
+        graph_says_no = bounded and least > accepted
+        while not (found or graph_says_no) or (len(found) < most and risk > accepted >= least):
             scenes = slice(len(found), len(found) + BATCH)
             found += self._each(
                 group, lambda s: np.maximum(s.lift(object_id, hold).disturbed, s.unstable * loses), scenes
@@ -387,9 +399,9 @@ class _Rehearsal:
             harm = 1.0 - np.prod(1.0 - np.array(found), axis=1)
             risk = self._risk(harm, doubt)
             least = self._risk(np.concatenate([harm, np.zeros(most - len(harm))]), doubt)
-        shares = zip(ids, np.mean(found, axis=0).tolist(), strict=True)
-        rehearsed = {i: share for i, share in shares if share > 0.0}
-        return _Trial(object_id, hold, harm, doubt, risk, rehearsed, moved)
+        shares = zip(ids, np.mean(found, axis=0).tolist() if found else [0.0] * len(ids), strict=True)
+        disturbed = {i: share for i, share in shares if share > 0.0}
+        return _Trial(object_id, hold, harm, doubt, risk, disturbed, moved)
 
     def take(self, trial: _Trial) -> None:
         """Continue without an object whose lift was tried; others that moved are put back."""
