@@ -24,6 +24,7 @@ from caryatid.manipulation.clearing import SimulatedHands, bodies_of, clear
 from caryatid.manipulation.grasps import Blocked, find_grasp, gripper_boxes
 from caryatid.manipulation.order import plan_order
 from caryatid.robots.reachability import ReachabilityMap, write_reachability
+from caryatid.scene import Scene
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.simulation.lifting import ASIDE, Lifting
 from caryatid.simulation.truth import ground_truth
@@ -317,6 +318,17 @@ class TestGrasps:
             "no safe order: lifting o1 disturbs o2; "
             "o2 cannot be grasped: no side fits between the fingers (80 mm)"
         )
+
+    def test_a_scene_plans_an_order_for_a_gripper_by_name(self):
+        scene = Scene()
+        scene.graph = graph_of(box((0.0, 0.0, TOP + 0.03), (0.06, 0.1, 0.06)))
+        (plain,) = scene.order().steps
+        (known,) = scene.order(gripper="franka", threads=1).steps
+        assert (plain.grasp, known.safe) == (None, True)
+        closing = known.grasp.T_world_gripper[:3, 1]
+        assert abs(closing[0]) == pytest.approx(1.0), "panda_hand_tcp closes along y, here on 6 cm"
+        with pytest.raises(InputError, match=r"'hand' is unknown; choose one of none, .*franka"):
+            scene.order(gripper="hand")
 
     def test_a_map_of_the_camera_is_none_of_the_gripper(self):
         reach = ReachabilityMap(np.full((8, 8, 8, 1), 255, np.uint8), -4.0 * np.ones(3), 1.0, 0.0, "camera")

@@ -412,6 +412,11 @@ class TestAPlannerOfAnotherPackage:
     def test_it_is_found_by_its_entry_point_and_listed_with_the_others(self, monkeypatch):
         with pytest.raises(InputError, match=f"unknown planner 'best'.*{', '.join(BUILT_IN)}, oracle"):
             make_planner("best")
+        assert isinstance(make_planner("caryatid.planning.planners.baselines:RandomPlanner"), RandomPlanner)
+        with pytest.raises(
+            InputError, match="'nowhere:Mine' cannot be made: No module named 'nowhere'"
+        ):
+            make_planner("nowhere:Mine")
         with pytest.raises(InputError, match="'oracle' requires the ground truth of a simulated scene"):
             make_planner("oracle")
         value = "caryatid.planning.planners.baselines:RandomPlanner"

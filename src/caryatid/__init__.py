@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from caryatid.runtime import hooks, imported_late
 
 if TYPE_CHECKING:
-    from caryatid.config import Config
+    from caryatid.config import Config, Gripper
     from caryatid.errors import CaryatidError, InputError
     from caryatid.exploration import Explorer, Step, explore, next_best_view
     from caryatid.fitting.primitives import fit
@@ -26,20 +26,22 @@ __version__ = "0.2.0"
 hooks |= {
     "scene": "caryatid.paper:choose_scene",
     "notebook cell": "caryatid.viz.notebook:draw_cell",
+    "next view": "caryatid.exploration:next_best_view",
+    "order": "caryatid.manipulation.order:plan_order",
     "viewer": "caryatid.viewer:show",
 }
 
 __all__ = [
-    "Box", "Camera", "CaryatidError", "Cloud", "Config", "Cylinder", "Explorer", "InputError", "Planner",
-    "Robot", "Scene", "SceneObject", "Session", "Sphere", "Step", "Support", "SupportGraph", "View",
-    "explore", "fit", "next_best_view", "read_recording", "simulate",
+    "Box", "Camera", "CaryatidError", "Cloud", "Config", "Cylinder", "Explorer", "Gripper", "InputError",
+    "Planner", "Robot", "Scene", "SceneObject", "Session", "Sphere", "Step", "Support", "SupportGraph",
+    "View", "explore", "fit", "next_best_view", "read_recording", "simulate",
 ]  # fmt: skip
 
 if not TYPE_CHECKING:
     __getattr__ = imported_late(
         __name__,
         {
-            "config": ["Config"],
+            "config": ["Config", "Gripper"],
             "errors": ["CaryatidError", "InputError"],
             "exploration": ["Explorer", "Step", "explore", "next_best_view"],
             "graph": ["SceneObject", "Support", "SupportGraph"],

@@ -362,7 +362,7 @@ class Explorer:
         way = way_to(self._moving(), decision.T_world_camera)
         if isinstance(way, Unreachable):
             raise PlanningError(way.reason)
-        self.step = replace(step, decision=decision.with_waypoints(way), stop=None)
+        self.step = replace(step, decision=decision.with_fields(waypoints=way), stop=None)
         return self.step
 
     def go(self) -> Step:
@@ -530,7 +530,7 @@ def next_best_view(
 
     Returns:
         The decision: `T_world_camera` is the view, `index` its index among the candidates, `waypoints` the
-        path to it, `why` the reason.
+        path to it, `why` the reason, `stop` why another view may not be worth its path.
 
     Raises:
         InputError: The candidates are not poses, or differ in number from the path lengths; or `visited` are
@@ -565,9 +565,9 @@ def next_best_view(
         candidates = reachable_views(robot, sphere)
     elif not isinstance(candidates, Candidates):
         candidates = given_candidates(candidates, path_length, poses[-1] if poses else None, sphere)
-    return _decide(
-        planning_state(scene, sphere, visited, candidates), robot, make_planner(planner), scene.seed
-    )[0]
+    state, chooser = planning_state(scene, sphere, visited, candidates), make_planner(planner)
+    decision, _ = _decide(state, robot, chooser, scene.seed)
+    return decision.with_fields(stop=reason_to_stop(state, scene.changed, chooser, decision))
 
 
 def reachable_views(robot: Robot, sphere: ViewSphere) -> Candidates:
@@ -623,7 +623,8 @@ def _decide(
         check_type("the planner's choice", decision, Decision, "return a Decision from plan()")
         way = way_to(robot, decision.T_world_camera)
         if not isinstance(way, Unreachable):
-            return decision.with_waypoints(way), state.candidates
+            log.info("next view: %s", decision.why)
+            return decision.with_fields(waypoints=way), state.candidates
         why = way.reason
         state = replace(state, candidates=state.candidates.without(decision.T_world_camera, why))
     raise _refused_all(why)

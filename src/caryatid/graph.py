@@ -246,8 +246,8 @@ class Grasp:
     """How a gripper takes hold of an object.
 
     Attributes:
-        T_world_gripper: Pose (4, 4) at the grasp: z along the approach, x along the closing direction, origin
-            between the fingertips or at the middle of the disc.
+        T_world_gripper: Pose (4, 4) at the grasp: z along the approach, x along the closing direction, turned
+            about z by `gripper.turn`; origin between the fingertips or at the middle of the disc.
         width: Width of the object between the fingers [m]; 0 for suction.
         travel: Length of the straight path to it along z [m], with nothing in the way.
         seen_free: Share of the space around that path which was seen empty [1]; None if unknown.

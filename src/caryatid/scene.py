@@ -12,9 +12,9 @@ from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from caryatid.config import Config, SegmentationMethod
+from caryatid.config import GRIPPERS, Config, GripperConfig, SegmentationMethod
 from caryatid.errors import CaryatidError, InputError, NoSurfaceError, WrongViewError, check_type
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
@@ -33,7 +33,7 @@ from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
 from caryatid.objects.reasons import Reasons
 from caryatid.runtime import Pictured, call
-from caryatid.runtime.parallel import check_budget, in_background, one_blas_thread
+from caryatid.runtime.parallel import check_budget, cores, in_background, one_blas_thread
 from caryatid.segmentation.diagnosis import (
     check_camera,
     check_depth,
@@ -59,6 +59,9 @@ from caryatid.support.relations import Effect, explain, infer, predict_removal
 
 if TYPE_CHECKING:
     import networkx as nx
+
+    from caryatid.manipulation.order import Order
+    from caryatid.planning.decision import Decision, Planner
 
 
 log = logging.getLogger(__name__)
@@ -218,6 +221,46 @@ class Scene(Pictured):
             InputError: The object is unknown, or it is the support surface.
         """
         return predict_removal(self.graph, object_id, self.config.support)
+
+    def order(
+        self,
+        *,
+        goal: str | None = None,
+        gripper: str | GripperConfig | None = None,
+        hands: int = 1,
+        steps: int | None = None,
+        threads: int | None = None,
+    ) -> Order:
+        """Find a safe order in which to remove all objects, or to reach one.
+
+        Args:
+            goal: Id of the object to reach; only objects in its way are removed.
+            gripper: Name of a gripper, such as `franka`, or its settings; None = that of the configuration,
+                without which every object can be grasped.
+            hands: 2 if another hand can hold one object, else 1.
+            steps: Maximum number of steps; None = all.
+            threads: Number of parallel rehearsals; None = all cores.
+
+        Raises:
+            GoalError: The goal is not an object of the graph.
+            InputError: The gripper is unknown, or the scene has no objects.
+        """
+        if isinstance(gripper, str) and gripper not in GRIPPERS:
+            raise InputError("gripper", f"'{gripper}' is unknown", f"choose one of {', '.join(GRIPPERS)}")
+        known = GRIPPERS[gripper] if isinstance(gripper, str) else gripper or self.config.gripper
+        options: Any = {"goal": goal, "hands": hands, "steps": steps, "seed": self.seed}
+        config = replace(self.config, gripper=known)
+        order: Order = call("order", self.graph, config, threads=threads or cores(), **options)
+        return order
+
+    def next_view(self, candidates: ArrayLike, *, planner: Planner | str = "support") -> Decision:
+        """Choose where to look next among camera poses (N, 4, 4); see `caryatid.next_best_view`.
+
+        Returns:
+            The decision: `index` of the pose, `why` it, and why to `stop` instead, or None.
+        """
+        decision: Decision = call("next view", self, candidates=candidates, planner=planner)
+        return decision
 
     def show(self) -> Any:
         """Open the viewer in the browser, or in the cell of a notebook.
@@ -589,6 +632,9 @@ class Scene(Pictured):
         self.views += 1
         watch.lap("fuse")
         self.timings = watch.laps
+        found, seconds = self.graph, sum(watch.laps.values())
+        counts = len(found.objects), len(found.supports)
+        log.info("%s: view %d, %d vertices, %d edges, %.2f s", source.name, self.views, *counts, seconds)
 
     def _named(self, source: View | Cloud) -> bool:
         """Whether a label identifies the same object in all views."""
@@ -737,9 +783,8 @@ class Scene(Pictured):
         self, observation: Observation, shown: set[int], voxels: VoxelMap, table: Array, given: bool
     ) -> Observation:
         """Fit the objects this view changed; split and merge automatic segments as the shapes suggest."""
-        kinds = self._models.find_outdated(shown, voxels)
-        self._models.fit_all(kinds, voxels, kinds)
-        shown = set(kinds)
+        shown = self._models.find_outdated(shown, voxels)
+        self._models.fit_all(shown, voxels)
         if self.identified:
             self._models.form(shown, voxels, table)
             return observation

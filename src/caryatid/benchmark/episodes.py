@@ -24,7 +24,7 @@ from caryatid.exploration import explore
 from caryatid.graph import SupportGraph, TakeStep
 from caryatid.manipulation.clearing import SimulatedHands, bodies_of
 from caryatid.manipulation.order import plan_order
-from caryatid.planning.planners import offered
+from caryatid.planning.planners import find_offered
 from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, list_scenes, load_scene
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.world import SimulatedScene, poses_of
@@ -143,7 +143,7 @@ def content_of(scene: str) -> str:
 @cache
 def plugin_of(planner: str) -> str:
     """Digest of the package that offers a planner; empty for built-in planners."""
-    point = offered().get(planner)
+    point = find_offered(planner)
     if point is None:
         return ""
     spec = find_spec(point.module.split(".")[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from math import inf
 from operator import attrgetter
@@ -30,7 +30,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from caryatid.config import (
     FusionMethod,
-    GripperKind,
+    GripperName,
     MaskIdentity,
     NoiseModel,
     Preset,
@@ -58,11 +58,17 @@ def default_of(setting: str, metavar: str | None = None) -> object:
 
 
 def planner_name() -> Any:
-    """The name of a planner, including those of other packages."""
+    """The name of a planner, including those of other packages, or module:Class."""
     from caryatid.planning.planners import BUILT_IN, ORACLE, offered
 
-    names: Any = Literal[(*BUILT_IN, *sorted(offered()), ORACLE)]
-    return ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(names, set()))
+    class Names(tuple[str, ...]):
+        def __contains__(self, name: Any) -> bool:
+            return ":" in name or super().__contains__(name)
+
+    names: Any = (*BUILT_IN, *sorted(offered()), ORACLE)
+    kind: Any = Literal[names]
+    known: Any = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kind, set()))
+    return replace(known, choices=Names(names), instance_from_str=lambda words: words[0])
 
 
 def number(
@@ -263,7 +269,8 @@ class PlanningCommand(LookingCommand):
     planner: Annotated[
         Annotated[str, planner_name()] | None, shown(default="support; paper with --preset paper")
     ] = None
-    """Planner of the next best view; oracle uses the ground truth and requires a simulation."""
+    """Planner of the next best view, or your own as module:Class; oracle uses the ground truth and requires a
+    simulation."""
     robot: Annotated[str, tyro.conf.arg(metavar="NAME")] = "humanoid"
     """Robot that carries the camera: humanoid, arm:FILE.npz (a reachability map), or module:callable."""
 
@@ -299,8 +306,8 @@ class LiftingCommand:
     """Object to reach; remove no more than necessary."""
     hands: Literal[1, 2] = 1
     """Number of hands; with 2, one may hold an object while the other lifts one."""
-    gripper: Annotated[GripperKind | None, default_of("gripper.kind")] = None
-    """Offer only lifts with a grasp on a free path; dimensions are the settings `gripper.*`."""
+    gripper: Annotated[GripperName | None, default_of("gripper.kind")] = None
+    """Offer only lifts with a grasp on a free path; a name sets the settings `gripper.*`."""
     reach: Annotated[Path | None, shown("FILE.npz")] = None
     """Offer only grasps within an arm's reach: a reachability map of the gripper, in the world frame."""
     risk: Annotated[Probability | None, default_of("rehearsal.risk")] = None
@@ -308,7 +315,12 @@ class LiftingCommand:
 
     def lift_settings(self) -> dict[str, object]:
         """Settings that have an option here, with its value, or None if omitted."""
-        return {"rehearsal.risk": self.risk, "gripper.kind": self.gripper}
+        from caryatid.config import GRIPPERS, GripperConfig
+
+        usual, known = GripperConfig(), GRIPPERS[self.gripper or "none"]
+        names = [f.name for f in fields(known) if getattr(known, f.name) != getattr(usual, f.name)]
+        gripper = {f"gripper.{name}": getattr(known, name) for name in names}
+        return {"rehearsal.risk": self.risk, "gripper.kind": self.gripper and known.kind} | gripper
 
     def reachable(self, config: Config) -> ReachabilityMap | None:
         """Which gripper poses the arm reaches; None = all.

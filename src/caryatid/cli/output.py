@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from caryatid.exploration import Step
 
 
+TOLD = {"caryatid.scene", "caryatid.exploration"}
+"""Loggers whose information the commands print themselves, view by view."""
+
+
 class Output(logging.Handler):
     """Print progress, results, and log messages of the package; `warnings` are those so far.
 
@@ -45,6 +49,8 @@ class Output(logging.Handler):
         """Print a log message, and keep it if it is a warning."""
         if record.levelno >= logging.WARNING:
             self.warnings.append(record.getMessage())
+        elif record.name in TOLD:
+            return
         self.say(record.getMessage())
 
     def say(self, text: str) -> None:

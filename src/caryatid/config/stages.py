@@ -670,7 +670,11 @@ class GripperConfig:
     length: Length = 0.06
     """Length of the fingers, or of the tube behind the disc [m]."""
     hand: Length = 0.08
-    """Breadth and length of the hand behind them [m]."""
+    """Length of the hand behind them, and its depth across the closing direction [m]."""
+    breadth: Distance = 0.0
+    """Breadth of the hand along the closing direction [m], at least the opening and both fingers."""
+    turn: Annotated[float, Field(ge=-180.0, le=180.0)] = 0.0
+    """Angle about the approach from the closing direction to the x axis of the gripper's own frame [deg]."""
     disc: Length = 0.015
     """Radius of a suction disc [m]."""
     tilt: Acute = 60.0
@@ -681,6 +685,20 @@ class GripperConfig:
     """Length of the straight approach, and of the lift along which the gripper touches nothing [m]."""
     seen: Share = 0.95
     """Minimum share of the space along the approach that was seen to be free [1]; the rest is noise."""
+
+
+Gripper = GripperConfig
+"""A gripper; its name in `caryatid`."""
+GRIPPERS: dict[str, GripperConfig] = {
+    "none": GripperConfig(),
+    "parallel": GripperConfig(kind="parallel"),
+    "suction": GripperConfig(kind="suction"),
+    # Fingers and hand of its URDF; `panda_hand_tcp` closes along y.
+    "franka": GripperConfig(kind="parallel", opening=0.08, length=0.045, breadth=0.204, turn=90.0),
+    "robotiq-85": GripperConfig(kind="parallel", opening=0.085),
+    "robotiq-140": GripperConfig(kind="parallel", opening=0.14),
+}
+"""Settings of grippers by name; what is not known of one is as by default."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

@@ -98,6 +98,9 @@ class Dataset(Sequence[View]):
     notes: tuple[str, ...] = ()
     is_video: bool = False
 
+    def __repr__(self) -> str:
+        return f"Dataset('{self.path}', {len(self.frames)} views)"
+
     def __len__(self) -> int:
         return len(self.frames)
 

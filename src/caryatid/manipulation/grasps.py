@@ -76,11 +76,14 @@ def find_grasp(
         fits = f"no side fits between the fingers ({1e3 * gripper.opening:.0f} mm)"
         return Blocked((), fits if jaw else "no side is flat enough")
     poses, widths = np.array([T for T, _ in found]), np.array([width for _, width in found])
+    R = transforms.rotation_from_vector(np.radians([0.0, 0.0, gripper.turn]))
+    turn = transforms.rigid(R, np.zeros(3))
     if reachable is not None:
-        before, after = poses.copy(), poses.copy()
+        turned = poses @ turn
+        before, after = turned.copy(), turned.copy()
         before[:, :3, 3] -= gripper.travel * poses[:, :3, 2]
         after[:, 2, 3] += gripper.travel
-        reached = reachable(poses) & reachable(before) & reachable(after)
+        reached = reachable(turned) & reachable(before) & reachable(after)
         poses, widths = poses[reached], widths[reached]
         if not len(poses):
             return Blocked((), "every grasp is out of reach")
@@ -111,7 +114,7 @@ def find_grasp(
             if free < gripper.seen:
                 unseen = True
                 continue
-        return Grasp(poses[k], float(widths[k]), gripper.travel, free)
+        return Grasp(poses[k] @ turn, float(widths[k]), gripper.travel, free)
     if unseen:
         return Blocked((), "the space around it was not seen empty")
     return Blocked(
@@ -170,8 +173,8 @@ def _spacing(shape: Shape) -> float:
 def gripper_boxes(gripper: GripperConfig, width: float) -> list[tuple[Array, Array]]:
     """Corners (3,), (3,) [m] of the boxes that a gripper consists of, in its frame, open around a width [m].
 
-    The frame has z along the approach, x along the closing direction, and its origin between the fingertips
-    or at the middle of the disc.
+    The frame has z along the approach, x along the closing direction (before `gripper.turn`), and its origin
+    between the fingertips or at the middle of the disc.
     """
     hand, back = gripper.hand / 2.0, -gripper.length
     if gripper.kind == "suction":
@@ -181,7 +184,10 @@ def gripper_boxes(gripper: GripperConfig, width: float) -> list[tuple[Array, Arr
         ]
     else:
         inner, side, end = width / 2.0 + gripper.clearance, gripper.finger, gripper.finger / 2.0
-        outer, broad = inner + gripper.finger, gripper.opening / 2.0 + gripper.finger
+        outer, broad = (
+            inner + gripper.finger,
+            max(gripper.breadth / 2.0, gripper.opening / 2.0 + gripper.finger),
+        )
         boxes = [
             ((inner, -side, back), (outer, side, end)),
             ((-outer, -side, back), (-inner, side, end)),
@@ -206,6 +212,6 @@ def _volume(gripper: GripperConfig, width: float, travel: float) -> Array:
 
 def _near(other: Shape, shape: Shape, gripper: GripperConfig) -> bool:
     """Whether a gripper around one shape may come near another."""
-    reach = gripper.travel + gripper.length + gripper.opening + 2.0 * gripper.hand
+    reach = gripper.travel + gripper.length + gripper.opening + gripper.breadth + 2.0 * gripper.hand
     between = np.linalg.norm(other.T_world_object[:3, 3] - shape.T_world_object[:3, 3])
     return bool(between <= reach + (np.linalg.norm(other.extents) + np.linalg.norm(shape.extents)) / 2.0)

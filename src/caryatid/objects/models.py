@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from caryatid.config import Config, SegmentationConfig, ShapeKind
+from caryatid.config import Config, SegmentationConfig
 from caryatid.fitting.primitives import ALONG, CONFIRMED, Fit, FitFailure, fit, free_inside
 from caryatid.geometry import transforms
 from caryatid.geometry.points import last_in_voxels, most_central, rotate, transform
@@ -383,16 +383,16 @@ class ObjectModels:
         self.points.bound(edges, config.cloud.views, config.cloud.depth)
         return {label for label in shown if label <= MAX_LABEL}
 
-    def find_outdated(self, labels: set[int], voxels: VoxelMap) -> dict[int, tuple[ShapeKind, ...]]:
-        """Find the objects among these whose shapes a new view may change, and what shapes they may be.
+    def find_outdated(self, labels: set[int], voxels: VoxelMap) -> set[int]:
+        """Find the objects among these whose shapes a new view may change.
 
         A shape holds while it explains the newest points as well as true shapes do, on sides that earlier
-        points confirm, and no more of its inside is seen free. With so many more points that their noise
-        matters less, it may still change, but not its kind.
+        points confirm, and no more of its inside is seen free; and until there are so many more points that
+        their noise matters less.
         """
         config, sigma = self._config, self._noise()
-        found = dict.fromkeys(labels - self.fits.keys(), config.fit.shapes)
-        for label in sorted(labels - found.keys()):
+        found = labels - self.fits.keys()
+        for label in sorted(labels - found):
             o, cloud = self._solids.get(label, self.fits[label]), self.points.newest(label)
             points, normals = cloud.points_world, cloud.normals_world
             if isinstance(o.shape, Solid):
@@ -407,12 +407,10 @@ class ObjectModels:
             if (
                 costs.mean() > config.explanation.usual
                 or new_mask.any()
+                or len(self.points.of(label)) >= GROWTH * count
                 or _count_free_inside(self.fits[label].shape, voxels) > free
             ):
-                found[label] = config.fit.shapes
-            elif len(self.points.of(label)) >= GROWTH * count:
-                kind = self.fits[label].shape.kind
-                found[label] = tuple(k for k in config.fit.shapes if k == kind)
+                found.add(label)
         return found
 
     def fit_newest(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
@@ -423,20 +421,9 @@ class ObjectModels:
         self.fits, self._compounds = {}, {}
         self._fit(labels, self.points.newest, voxels)
 
-    def fit_all(
-        self,
-        labels: Iterable[int],
-        voxels: VoxelMap | None = None,
-        kinds: Mapping[int, tuple[ShapeKind, ...]] | None = None,
-    ) -> None:
-        """Fit objects to all their points so far (`pc`, `pc+sg`), where shapes fill no space seen free.
-
-        Args:
-            labels: The objects.
-            voxels: Space seen free.
-            kinds: What shapes each may be; by default, what is configured.
-        """
-        self._fit(labels, partial(self.points.of, edge=self._config.cloud.voxel), voxels, kinds)
+    def fit_all(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
+        """Fit objects to all their points so far (`pc`, `pc+sg`), where shapes fill no space seen free."""
+        self._fit(labels, partial(self.points.of, edge=self._config.cloud.voxel), voxels)
 
     def divide(self, labels: set[int], voxels: VoxelMap | None = None) -> set[int]:
         """Split objects with new points that several shapes explain better than one.
@@ -646,21 +633,15 @@ class ObjectModels:
         return max(self._table[1], primitives, config.fit.registration)
 
     def _fit(
-        self,
-        labels: Iterable[int],
-        points_of: Callable[[int], Cloud],
-        voxels: VoxelMap | None = None,
-        kinds: Mapping[int, tuple[ShapeKind, ...]] | None = None,
+        self, labels: set[int], points_of: Callable[[int], Cloud], voxels: VoxelMap | None = None
     ) -> None:
         """Fit objects to their points on all cores; the result for each does not depend on the others."""
         names = sorted(labels)
 
         def fitted(number: int) -> Fit | FitFailure:
             cloud, rng = points_of(names[number]), np.random.default_rng([self._seed, names[number]])
-            config = self._config.fit
-            if kinds and kinds[names[number]] != config.shapes:
-                config = replace(config, shapes=kinds[names[number]])
-            return fit(cloud.points_world, cloud.normals_world, config=config, rng=rng, space=voxels)
+            points, normals = cloud.points_world, cloud.normals_world
+            return fit(points, normals, config=self._config.fit, rng=rng, space=voxels)
 
         for label, result in zip(names, on_threads(fitted, len(names)), strict=True):
             self.fits.pop(label, None)

@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +83,7 @@ class Decision(Pictured):
             that returns the array, because most pictures are never drawn.
         waypoints: The path to the view: postures, from the current one to the one at the view, connected by
             straight lines. Only the last if the robot returns no others; empty without a robot.
+        stop: Why another view may not be worth its path, or None.
     """
 
     T_world_camera: Array
@@ -95,15 +96,18 @@ class Decision(Pictured):
     candidate_saliency: Array | None = None
     sphere_saliency: PaintedLate = PaintedLate()
     waypoints: tuple[Posture, ...] = ()
+    stop: str | None = None
 
-    def with_waypoints(self, waypoints: tuple[Posture, ...]) -> Decision:
-        """Return the same decision with waypoints."""
+    def with_fields(self, **fields: Any) -> Decision:
+        """Return the same decision with other fields."""
         decision = copy.copy(self)
-        object.__setattr__(decision, "waypoints", waypoints)
+        for name, value in fields.items():
+            object.__setattr__(decision, name, value)
         return decision
 
     def __repr__(self) -> str:
-        return f"Decision(candidate {self.index}, score {self.score:.3f}: {self.why})"
+        stop = f"; stop: {self.stop}" if self.stop else ""
+        return f"Decision(candidate {self.index}, score {self.score:.3f}: {self.why}{stop})"
 
 
 class Planner(Protocol):

@@ -27,9 +27,9 @@ hooks: dict[str, str] = {}
 `module:function`, imported at the first call; registered in `caryatid/__init__.py`."""
 
 
-def call(hook: str, *arguments: Any) -> Any:
+def call(hook: str, *arguments: Any, **options: Any) -> Any:
     """Call the function registered for one of the `hooks`, and return its result."""
-    return resolve_name(hooks[hook])(*arguments)
+    return resolve_name(hooks[hook])(*arguments, **options)
 
 
 class Pictured:

@@ -441,14 +441,12 @@ class Session:
                 raise InputError("refused", "is given with candidates", "omit them from the candidates")
             reachable = reachable.without(as_rigid(T, f"refused[{number}]"), REFUSED)
         visited = sphere.direction_of(T_world_cameras)
-        planner = make_planner(self.beginning.planner)
         decision = exploration.next_best_view(
-            self.scene, robot, visited, candidates=reachable, planner=planner
+            self.scene, robot, visited, candidates=reachable, planner=self.beginning.planner
         )
-        state = exploration.planning_state(self.scene, sphere, visited, reachable)
         reports = [number for number, event in enumerate(self._events, start=1) if event.kind == "report"]
-        stop = exploration.used_up(len(self._events) - max(reports, default=0), state.config)
-        stop = stop or exploration.reason_to_stop(state, self.scene.changed, planner, decision)
+        views = len(self._events) - max(reports, default=0)
+        stop = exploration.used_up(views, self.scene.config.active) or decision.stop
         return NextView(self.views, decision, stop)
 
     def replay(self) -> Iterator[Step]:

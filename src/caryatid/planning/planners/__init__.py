@@ -40,8 +40,13 @@ def offered() -> dict[str, EntryPoint]:
     return {point.name: point for point in points if point.name not in {*BUILT_IN, ORACLE}}
 
 
+def find_offered(name: str) -> EntryPoint | None:
+    """Return the entry point of another package's planner, by its name or as `module:Class`."""
+    return EntryPoint(name, name, "caryatid.planners") if ":" in name else offered().get(name)
+
+
 def make_planner(name: Planner | str) -> Planner:
-    """Return the planner of this name; a planner is returned unchanged.
+    """Return the planner of this name, or of `module:Class`; a planner is returned unchanged.
 
     Raises:
         InputError: There is none, and the message lists the known ones; or it is `oracle`.
@@ -52,12 +57,15 @@ def make_planner(name: Planner | str) -> Planner:
     if name in BUILT_IN:
         module, maker, *arguments = BUILT_IN[name]
         return getattr(import_module(f"{__name__}.{module}"), maker)(*arguments)
-    others = offered()
-    if name in others:
-        return others[name].load()()
+    if point := find_offered(name):
+        try:
+            return point.load()()
+        except (ImportError, AttributeError, TypeError) as error:
+            remedy = "give module:Class, or module:function, callable without arguments"
+            raise InputError("planner", f"'{name}' cannot be made: {error}", remedy) from None
     if name == ORACLE:
         reason = f"'{ORACLE}' requires the ground truth of a simulated scene"
         remedy = "give a scene, or create caryatid.evaluation.oracle.OraclePlanner"
         raise InputError("planner", reason, remedy)
-    names = ", ".join([*BUILT_IN, *sorted(others), ORACLE])
-    raise InputError("planner", f"unknown planner '{name}'", f"choose one of {names}")
+    names = ", ".join([*BUILT_IN, *sorted(offered()), ORACLE])
+    raise InputError("planner", f"unknown planner '{name}'", f"choose one of {names}, or give module:Class")
