@@ -38,10 +38,10 @@ from caryatid.benchmark.episodes import open_scene
 from caryatid.benchmark.suites import DENSE, HEAPED
 from caryatid.config import Config, GripperConfig
 from caryatid.config.settings import read_settings
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.transforms import Array, invert
 from caryatid.graph import Grasp, TakeStep
 from caryatid.manipulation.clearing import SimulatedHands, Taken, clear
-from caryatid.manipulation.grasps import gripper_boxes
+from caryatid.manipulation.grasps import gripper_boxes, turn_of
 from caryatid.manipulation.order import plan_order
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.world import SimulatedScene, poses_of, quaternion
@@ -134,7 +134,7 @@ def grasped(
     scene: SimulatedScene, state: Array, grasp: Grasp, body: str, gripper: GripperConfig
 ) -> tuple[list[str], bool]:
     """Simulate a grasp; return the other bodies it touches, and whether it lifts its own."""
-    spec, T = scene.spec.copy(), grasp.T_world_gripper
+    spec, T = scene.spec.copy(), grasp.T_world_gripper @ invert(turn_of(gripper))
     # MuJoCo's documentation recommends elliptic cones with stiff friction for grasps.
     spec.option.timestep, spec.option.cone, spec.option.impratio = 0.002, mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
     start, R = T[:3, 3] - grasp.travel * T[:3, 2], T[:3, :3]

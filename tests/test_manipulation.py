@@ -327,7 +327,9 @@ class TestGrasps:
         assert (plain.grasp, known.safe) == (None, True)
         closing = known.grasp.T_world_gripper[:3, 1]
         assert abs(closing[0]) == pytest.approx(1.0), "panda_hand_tcp closes along y, here on 6 cm"
-        with pytest.raises(InputError, match=r"'hand' is unknown; choose one of none, .*franka"):
+        scene.config = with_gripper(replace(JAW, opening=0.03))
+        assert "(30 mm)" in scene.order(gripper="parallel").refusal, "a kind keeps the settings"
+        with pytest.raises(InputError, match="'hand' is unknown; choose one of franka, none"):
             scene.order(gripper="hand")
 
     def test_a_map_of_the_camera_is_none_of_the_gripper(self):

@@ -413,9 +413,7 @@ class TestAPlannerOfAnotherPackage:
         with pytest.raises(InputError, match=f"unknown planner 'best'.*{', '.join(BUILT_IN)}, oracle"):
             make_planner("best")
         assert isinstance(make_planner("caryatid.planning.planners.baselines:RandomPlanner"), RandomPlanner)
-        with pytest.raises(
-            InputError, match="'nowhere:Mine' cannot be made: No module named 'nowhere'"
-        ):
+        with pytest.raises(InputError, match="'nowhere:Mine' cannot be made: No module named 'nowhere'"):
             make_planner("nowhere:Mine")
         with pytest.raises(InputError, match="'oracle' requires the ground truth of a simulated scene"):
             make_planner("oracle")

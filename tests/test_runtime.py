@@ -30,6 +30,20 @@ def test_work_that_is_shared_out_may_share_out_work():
     assert parallel.on_threads(rows, 20) == [sum(range(10 * n, 10 * n + 10)) for n in range(20)]
 
 
+def test_after_a_failure_no_other_task_begins_and_none_goes_on():
+    begun, over = [], []
+
+    def task(number):
+        begun.append(number)
+        if number == 2:
+            raise ValueError("broken")
+        over.append(number)
+
+    with pytest.raises(ValueError, match="broken"):
+        parallel.on_threads(task, 10_000)
+    assert len(over) == len(begun) - 1
+
+
 OVERLAPPING = """
 import sys
 from threading import Event, Thread

@@ -32,7 +32,7 @@ from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Camera, Cloud, View
 from caryatid.support.relations import Removal
 
-log = logging.getLogger(__name__)
+log, progress = logging.getLogger(__name__), logging.getLogger("caryatid.progress")
 
 UNTIL = 0.95
 """Default probability at which the effects of removing the goal count as known [1]."""
@@ -623,7 +623,7 @@ def _decide(
         check_type("the planner's choice", decision, Decision, "return a Decision from plan()")
         way = way_to(robot, decision.T_world_camera)
         if not isinstance(way, Unreachable):
-            log.info("next view: %s", decision.why)
+            progress.info("next view: %s", decision.why)
             return decision.with_fields(waypoints=way), state.candidates
         why = way.reason
         state = replace(state, candidates=state.candidates.without(decision.T_world_camera, why))

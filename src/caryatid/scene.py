@@ -9,12 +9,12 @@ from concurrent.futures import Future, wait
 from dataclasses import replace
 from time import perf_counter
 from types import NoneType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from caryatid.config import GRIPPERS, Config, GripperConfig, SegmentationMethod
+from caryatid.config import GRIPPERS, Config, GripperConfig, GripperKind, SegmentationMethod
 from caryatid.errors import CaryatidError, InputError, NoSurfaceError, WrongViewError, check_type
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from caryatid.planning.decision import Decision, Planner
 
 
-log = logging.getLogger(__name__)
+log, progress = logging.getLogger(__name__), logging.getLogger("caryatid.progress")
 
 KEPT = "%s; this view is kept until a later one shows the table top"
 """Log message for a view without a support surface."""
@@ -233,31 +233,51 @@ class Scene(Pictured):
     ) -> Order:
         """Find a safe order in which to remove all objects, or to reach one.
 
+        A gripper moves only through space that was seen empty.
+
         Args:
             goal: Id of the object to reach; only objects in its way are removed.
-            gripper: Name of a gripper, such as `franka`, or its settings; None = that of the configuration,
-                without which every object can be grasped.
+            gripper: Kind or name of a gripper, such as `franka`, or its settings; None = that of the
+                configuration, without which every object can be grasped.
             hands: 2 if another hand can hold one object, else 1.
             steps: Maximum number of steps; None = all.
             threads: Number of parallel rehearsals; None = all cores.
+
+        Returns:
+            The order: its `steps`, whether it is `safe`, and the `risk` of all lifts together.
 
         Raises:
             GoalError: The goal is not an object of the graph.
             InputError: The gripper is unknown, or the scene has no objects.
         """
-        if isinstance(gripper, str) and gripper not in GRIPPERS:
-            raise InputError("gripper", f"'{gripper}' is unknown", f"choose one of {', '.join(GRIPPERS)}")
-        known = GRIPPERS[gripper] if isinstance(gripper, str) else gripper or self.config.gripper
-        options: Any = {"goal": goal, "hands": hands, "steps": steps, "seed": self.seed}
-        config = replace(self.config, gripper=known)
-        order: Order = call("order", self.graph, config, threads=threads or cores(), **options)
+        names = {*GRIPPERS, *get_args(GripperKind)}
+        if isinstance(gripper, str) and gripper not in names:
+            remedy = f"choose one of {', '.join(sorted(names))}"
+            raise InputError("gripper", f"'{gripper}' is unknown", remedy)
+        if isinstance(gripper, str):
+            kind: Any = gripper
+            gripper = GRIPPERS.get(gripper) or replace(self.config.gripper, kind=kind)
+        check_type("gripper", gripper, (GripperConfig, NoneType), "give a name or a caryatid.Gripper")
+        config = replace(self.config, gripper=gripper or self.config.gripper)
+        order: Order = call(
+            "order", self.graph, config, goal=goal, hands=hands, steps=steps, seed=self.seed,
+            threads=cores() if threads is None else threads, voxels=self.voxels,
+        )  # fmt: skip
         return order
 
     def next_view(self, candidates: ArrayLike, *, planner: Planner | str = "support") -> Decision:
-        """Choose where to look next among camera poses (N, 4, 4); see `caryatid.next_best_view`.
+        """Choose where to look next; `caryatid.next_best_view` has more options.
+
+        Args:
+            candidates: Camera poses (N, 4, 4) to choose from.
+            planner: Planner, or its name.
 
         Returns:
-            The decision: `index` of the pose, `why` it, and why to `stop` instead, or None.
+            The decision: `index` of the pose, `why` says why, and `stop` why to look no further, or None.
+
+        Raises:
+            InputError: The candidates are not poses.
+            PlanningError: The scene has no view yet.
         """
         decision: Decision = call("next view", self, candidates=candidates, planner=planner)
         return decision
@@ -634,7 +654,7 @@ class Scene(Pictured):
         self.timings = watch.laps
         found, seconds = self.graph, sum(watch.laps.values())
         counts = len(found.objects), len(found.supports)
-        log.info("%s: view %d, %d vertices, %d edges, %.2f s", source.name, self.views, *counts, seconds)
+        progress.info("%s: view %d, %d vertices, %d edges, %.2f s", source.name, self.views, *counts, seconds)
 
     def _named(self, source: View | Cloud) -> bool:
         """Whether a label identifies the same object in all views."""

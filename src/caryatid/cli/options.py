@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
 from operator import attrgetter
@@ -62,6 +62,8 @@ def planner_name() -> Any:
     from caryatid.planning.planners import BUILT_IN, ORACLE, offered
 
     class Names(tuple[str, ...]):
+        """The names that are offered; others, with a colon, are accepted too."""
+
         def __contains__(self, name: Any) -> bool:
             return ":" in name or super().__contains__(name)
 
@@ -139,12 +141,21 @@ class Settings:
     set: Annotated[Words, tyro.conf.arg(metavar="STAGE.NAME=VALUE")] = ()
     """Change one setting, such as `--set fit.hypotheses=200`; overrides the file; may be repeated."""
 
-    def read(self, options: Mapping[str, object] | None = None, base: Config | None = None) -> Config:
-        """The configuration: options (name of a setting → value, or None) > --set > file > base."""
+    def read(
+        self,
+        options: Mapping[str, object] | None = None,
+        base: Config | None = None,
+        *,
+        named: Mapping[str, object] | None = None,
+    ) -> Config:
+        """The configuration: options (name of a setting → value, or None) > --set > named > file > base."""
         from caryatid.config.settings import read_settings
 
-        given = [f"{name}={value}" for name, value in (options or {}).items() if value is not None]
-        return read_settings(self.config, (*self.set, *given), base)
+        first, last = (
+            [f"{name}={value}" for name, value in (given or {}).items() if value is not None]
+            for given in (named, options)
+        )
+        return read_settings(self.config, (*first, *self.set, *last), base)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,6 +179,7 @@ class Modelling(Settings):
         options: Mapping[str, object] | None = None,
         base: Config | None = None,
         *,
+        named: Mapping[str, object] | None = None,
         takes_views: bool = False,
     ) -> Config:
         """The configuration, as `Settings.read` returns it, with the options here.
@@ -182,7 +194,8 @@ class Modelling(Settings):
             raise InputError(f"--masks {self.masks}", reason, "use it with explore, extract, clear or view")
         base = base or preset(self.preset)
         identity = None if self.masks_from else self.masks
-        return super().read({"fusion.method": self.fusion, "fusion.masks": identity, **(options or {})}, base)
+        given = {"fusion.method": self.fusion, "fusion.masks": identity, **(options or {})}
+        return super().read(given, base, named=named)
 
     @property
     def masks_from(self) -> str | None:
@@ -293,9 +306,12 @@ class ExploringCommand(PlanningCommand):
     keyframe: Annotated[str | None, shown("NAME", "home, or the only one")] = None
     """Name or number of the keyframe that an MJCF scene starts from."""
 
-    def config(self, options: Mapping[str, object] | None = None) -> Config:
-        """All settings; `options` as for `Settings.read`."""
-        return self.settings.read({"active.max_views": self.views, **(options or {})}, takes_views=True)
+    def config(
+        self, options: Mapping[str, object] | None = None, named: Mapping[str, object] | None = None
+    ) -> Config:
+        """All settings; options and named ones as for `Settings.read`."""
+        given = {"active.max_views": self.views, **(options or {})}
+        return self.settings.read(given, named=named, takes_views=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -315,12 +331,19 @@ class LiftingCommand:
 
     def lift_settings(self) -> dict[str, object]:
         """Settings that have an option here, with its value, or None if omitted."""
-        from caryatid.config import GRIPPERS, GripperConfig
+        from caryatid.config import GRIPPERS
 
-        usual, known = GripperConfig(), GRIPPERS[self.gripper or "none"]
-        names = [f.name for f in fields(known) if getattr(known, f.name) != getattr(usual, f.name)]
-        gripper = {f"gripper.{name}": getattr(known, name) for name in names}
-        return {"rehearsal.risk": self.risk, "gripper.kind": self.gripper and known.kind} | gripper
+        kind = GRIPPERS[self.gripper].kind if self.gripper in GRIPPERS else self.gripper
+        return {"rehearsal.risk": self.risk, "gripper.kind": kind}
+
+    def gripper_settings(self) -> dict[str, object]:
+        """Settings of a gripper that is known by name."""
+        from caryatid.config import GRIPPERS
+
+        if (known := GRIPPERS.get(self.gripper or "")) is None:
+            return {}
+        names = ("opening", "finger", "length", "hand", "breadth", "turn")
+        return {f"gripper.{name}": getattr(known, name) for name in names}
 
     def reachable(self, config: Config) -> ReachabilityMap | None:
         """Which gripper poses the arm reaches; None = all.

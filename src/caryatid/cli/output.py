@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from caryatid.exploration import Step
 
 
-TOLD = {"caryatid.scene", "caryatid.exploration"}
-"""Loggers whose information the commands print themselves, view by view."""
+TOLD = "caryatid.progress"
+"""Logger of what the commands print themselves, view by view."""
 
 
 class Output(logging.Handler):
@@ -49,7 +49,7 @@ class Output(logging.Handler):
         """Print a log message, and keep it if it is a warning."""
         if record.levelno >= logging.WARNING:
             self.warnings.append(record.getMessage())
-        elif record.name in TOLD:
+        elif record.name == TOLD:
             return
         self.say(record.getMessage())
 

@@ -688,17 +688,14 @@ class GripperConfig:
 
 
 Gripper = GripperConfig
-"""A gripper; its name in `caryatid`."""
+"""`GripperConfig`, as `caryatid` exports it."""
 GRIPPERS: dict[str, GripperConfig] = {
-    "none": GripperConfig(),
-    "parallel": GripperConfig(kind="parallel"),
-    "suction": GripperConfig(kind="suction"),
     # Fingers and hand of its URDF; `panda_hand_tcp` closes along y.
     "franka": GripperConfig(kind="parallel", opening=0.08, length=0.045, breadth=0.204, turn=90.0),
     "robotiq-85": GripperConfig(kind="parallel", opening=0.085),
     "robotiq-140": GripperConfig(kind="parallel", opening=0.14),
 }
-"""Settings of grippers by name; what is not known of one is as by default."""
+"""Grippers by name; what is not known of one is as by default."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

@@ -76,8 +76,7 @@ def find_grasp(
         fits = f"no side fits between the fingers ({1e3 * gripper.opening:.0f} mm)"
         return Blocked((), fits if jaw else "no side is flat enough")
     poses, widths = np.array([T for T, _ in found]), np.array([width for _, width in found])
-    R = transforms.rotation_from_vector(np.radians([0.0, 0.0, gripper.turn]))
-    turn = transforms.rigid(R, np.zeros(3))
+    turn = turn_of(gripper)
     if reachable is not None:
         turned = poses @ turn
         before, after = turned.copy(), turned.copy()
@@ -120,6 +119,12 @@ def find_grasp(
     return Blocked(
         fewest or (), f"{', '.join(fewest)} in the way" if fewest else "it is too large for the hand"
     )
+
+
+def turn_of(gripper: GripperConfig) -> Array:
+    """Return the pose (4, 4) of a gripper's own frame in the one of `gripper_boxes`."""
+    R = transforms.rotation_from_vector(np.radians([0.0, 0.0, gripper.turn]))
+    return transforms.rigid(R, np.zeros(3))
 
 
 def _antipodal(shape: Shape, gripper: GripperConfig, friction: float) -> Iterator[tuple[Array, float]]:
@@ -184,10 +189,8 @@ def gripper_boxes(gripper: GripperConfig, width: float) -> list[tuple[Array, Arr
         ]
     else:
         inner, side, end = width / 2.0 + gripper.clearance, gripper.finger, gripper.finger / 2.0
-        outer, broad = (
-            inner + gripper.finger,
-            max(gripper.breadth / 2.0, gripper.opening / 2.0 + gripper.finger),
-        )
+        outer = inner + gripper.finger
+        broad = max(gripper.breadth / 2.0, gripper.opening / 2.0 + gripper.finger)
         boxes = [
             ((inner, -side, back), (outer, side, end)),
             ((-outer, -side, back), (-inner, side, end)),

@@ -192,6 +192,7 @@ def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_
         return None, tried
     while not (best := min(tried, key=lambda t: (t.risk, len(t.harmed)))).rehearsed:
         tried[tried.index(best)] = rehearsal.try_lift(best.object_id)
+    tried.sort(key=lambda t: (t.risk, len(t.harmed)))
     # The other hand holds one of those that were disturbed, the most often first.
     holds = ((t.object_id, held) for t in tried for held in sorted(t.harmed, key=lambda i: (-t.harmed[i], i)))
     for object_id, held in holds if hands > 1 else ():
@@ -390,8 +391,8 @@ class _Rehearsal:
         accepted, most = self.accepted, self._config.rehearsal.draws
         found, harm = list[Array](), np.zeros(0)
         risk = least = self._risk(np.zeros(most), doubt)
-        graph_says_no = bounded and least > accepted
-        while not (found or graph_says_no) or (len(found) < most and risk > accepted >= least):
+        cannot_be_safe = bounded and least > accepted
+        while not (found or cannot_be_safe) or (len(found) < most and risk > accepted >= least):
             scenes = slice(len(found), len(found) + BATCH)
             found += self._each(
                 group, lambda s: np.maximum(s.lift(object_id, hold).disturbed, s.unstable * loses), scenes

@@ -124,10 +124,9 @@ def colour_evidence(first: Evidence, second: Evidence, config: ExplanationConfig
 
 
 def unity(evidence: Evidence, seconds: NDArray[np.bool_], config: ExplanationConfig) -> Array:
-    """Evidence (S,) [nats] of views that points, and each of some second sides (S, N), are one object.
+    """Evidence (S,) [nats] of views that each of some second sides (S, N) and the rest are one object.
 
-    Each point of the side with fewer in a view speaks, by the share of the other side's on its segment; it
-    is at least 0.
+    Each point of the side with fewer in a view speaks, by the share of the other side's on its segment.
     """
     points = np.zeros(len(seconds))
     for own in () if evidence.segments is None else evidence.segments:
@@ -260,6 +259,9 @@ def explain_sides(
         fit_config: Settings of the fits.
         rng: Source of the samples.
         first_look: Make quick fits, which only tell what is worth a full one.
+
+    Returns:
+        An explanation for each side, in order.
     """
     settings = _quick(fit_config) if first_look else _thorough(fit_config)
     kinds = [KINDS[kind] for kind in settings.shapes]
@@ -346,4 +348,4 @@ def _quick(config: FitConfig) -> FitConfig:
 @cache
 def _thorough(config: FitConfig) -> FitConfig:
     """Settings of a full fit."""
-    return replace(config, polish=1, search_points=config.max_points)
+    return replace(config, polish=1)

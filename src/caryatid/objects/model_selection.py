@@ -360,7 +360,7 @@ def best_merge(
         return compare(sides, config, np.random.default_rng([seed, *pairs[number]])).gain
 
     gains.update(zip(pairs, on_threads(gain_of, len(pairs)), strict=True))
-    for a, b in [pair for pair, gain in gains.items() if gain <= 0.0]:
+    for a, b in [pair for pair, gain in gains.items() if not gain > 0.0]:
         apart[a, b] = len(evidence[a]) + len(evidence[b])
         del gains[a, b]
     if not gains:
@@ -436,9 +436,9 @@ def _neighbours(tree: cKDTree) -> Groups:
 
 
 def _borders(evidence: Evidence, seconds: Mask, near: Groups, config: Config) -> Array:
-    """Cost (S,) [nats] of the border of each of some second sides (S, N): where the surface continues.
+    """Cost (S,) [nats] of the border of each of some second sides (S, N).
 
-    It does without a concave crease.
+    A border costs where the surface continues, without a concave crease.
     """
     row, col = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()
     between = evidence.points[col] - evidence.points[row]

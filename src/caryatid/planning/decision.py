@@ -83,7 +83,7 @@ class Decision(Pictured):
             that returns the array, because most pictures are never drawn.
         waypoints: The path to the view: postures, from the current one to the one at the view, connected by
             straight lines. Only the last if the robot returns no others; empty without a robot.
-        stop: Why another view may not be worth its path, or None.
+        stop: Why another view may not be worth its path, or None; steps of the loop say it themselves.
     """
 
     T_world_camera: Array

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import logging
 import os
+from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from functools import cache, partial, wraps
 from pathlib import Path
@@ -164,12 +165,21 @@ def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
         for index in indices:
             results[index] = task(index)
 
-    helpers = min(numba.get_num_threads(), cores(), count) - 1
-    shares = [_threads(os.getpid()).submit(take_share) for _ in range(helpers)]
-    take_share()
-    for share in shares:
-        if not share.cancel():  # a share that has not begun would find nothing left
-            share.result()
+    threads = numba.get_num_threads()
+
+    def help_out() -> None:
+        numba.set_num_threads(threads)
+        take_share()
+
+    shares = [_threads(os.getpid()).submit(help_out) for _ in range(min(threads, cores(), count) - 1)]
+    try:
+        take_share()
+    finally:
+        deque(indices, maxlen=0)  # where a task failed, no other begins
+        begun = [share for share in shares if not share.cancel()]
+        wait(begun)
+    for share in begun:
+        share.result()
     return results
 
 

@@ -93,10 +93,10 @@ def support_forces(
         total += trust
         alike += draw.likeness >= 0.5
     # Divided before they are weighted: rounding must not exceed the weight.
-    seen, hidden = at_rest / total[pressed], moving / total[pressed]
+    resting, falling = at_rest / total[pressed], moving / total[pressed]
     visible = np.where(scene.explained, 1.0, 1.0 - config.unexplained)
     shares, means = np.zeros((count, count)), np.zeros((count, count, 3))
-    shares[pressing, pressed] = (visible * seen + (1.0 - config.unexplained) * hidden).clip(0.0, 1.0)
+    shares[pressing, pressed] = (visible * resting + (1.0 - config.unexplained) * falling).clip(0.0, 1.0)
     means[pressing, pressed] = forces / total[pressed, None]
     return SupportForces(shares, means, alike / config.draws, scene.contacts, scene.areas)
 
@@ -271,9 +271,9 @@ class Equilibrium:
     def _falling(self) -> NDArray[np.intp]:
         """Objects (M,) that nothing carries in the estimated scene, by index."""
         balance = self.solve(next(self.draws(np.random.default_rng(0))))
-        return np.flatnonzero(self._uncarried(balance))
+        return np.flatnonzero(self._find_uncarried_mask(balance))
 
-    def _uncarried(self, balance: Balance) -> NDArray[np.bool_]:
+    def _find_uncarried_mask(self, balance: Balance) -> NDArray[np.bool_]:
         """Which objects (N,) may fall: nothing carries them."""
         upwards = np.bincount(self.pairs[:, 1], balance.pushes[:, 2], len(self._objects))
         return (upwards <= self._config.force_share) & ~self.fixed
@@ -331,7 +331,7 @@ class Equilibrium:
         hidden gaps (K,) [m] let them meet first.
         """
         far = draw.gaps > self._config.reach
-        loose = self._uncarried(self.solve(replace(draw, gaps=np.where(far, np.inf, hidden))))
+        loose = self._find_uncarried_mask(self.solve(replace(draw, gaps=np.where(far, np.inf, hidden))))
         far &= ~loose[self._pairs].any(axis=1)
         pressed = self.solve(replace(draw, gaps=np.where(far, np.inf, hidden))).pressed
         return far, pressed & (draw.gaps > self._config.at_rest * self._fall)

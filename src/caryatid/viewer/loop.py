@@ -24,7 +24,7 @@ from caryatid.graph import TakeStep
 from caryatid.manipulation.clearing import SimulatedHands, Taken, clear
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.decision import Decision
-from caryatid.planning.planners import BUILT_IN, ORACLE, offered
+from caryatid.planning.planners import BUILT_IN, offered
 from caryatid.runtime.parallel import cores
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.lifting import ASIDE
@@ -253,7 +253,7 @@ class LoopPage(Page):
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        names = [*BUILT_IN, *sorted(offered()), *([ORACLE] if self.planner == ORACLE else [])]
+        names = [*dict.fromkeys([*BUILT_IN, *sorted(offered()), self.planner])]
         with gui.add_folder("loop", order=-10):
             self._next = gui.add_button("next view", hint="Move to the next view and take it")
             self._go = gui.add_button("run", hint="Take views until the exploration would stop")

@@ -41,8 +41,16 @@ def offered() -> dict[str, EntryPoint]:
 
 
 def find_offered(name: str) -> EntryPoint | None:
-    """Return the entry point of another package's planner, by its name or as `module:Class`."""
-    return EntryPoint(name, name, "caryatid.planners") if ":" in name else offered().get(name)
+    """Return the entry point of another package's planner, by its name or as `module:Class`.
+
+    Raises:
+        InputError: There is a colon, but not between a module and a name.
+    """
+    if ":" not in name:
+        return offered().get(name)
+    if not EntryPoint.pattern.match(name):
+        raise InputError("planner", f"'{name}' names no planner", "give module:Class")
+    return EntryPoint(name, name, "caryatid.planners")
 
 
 def make_planner(name: Planner | str) -> Planner:
