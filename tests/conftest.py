@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import os
 import shutil
 from contextlib import contextmanager
@@ -36,6 +37,9 @@ from caryatid.viz.report import find_chromium
 if "PYTEST_XDIST_WORKER" in os.environ:
     # The workers share the cores: threads that wait for one that is taken hold up every parallel loop.
     numba.set_num_threads(1)
+
+# Tests ask whether something unusual was said; a command in the same process sets the level of its loggers.
+logging.getLogger("caryatid.progress").setLevel(logging.WARNING)
 
 SMALL_SENSOR = SensorConfig(width=160, height=120, focal=131.25)
 """A quarter of the usual image: what tests of the commands need, in a tenth of the time."""

@@ -297,6 +297,15 @@ def check_same(one, other):
         assert one == other
 
 
+def test_the_log_tells_each_view_and_decision(caplog):
+    with caplog.at_level("INFO", "caryatid.progress"):
+        steps = exploration()
+    told = [record.getMessage() for record in caplog.records if record.name == "caryatid.progress"]
+    views = [f"{len(s.graph.objects)} vertices, {len(s.graph.supports)} edges" for s in steps]
+    assert [any(view in line for line in told) for view in views] == [True] * len(steps)
+    assert f"next view: {steps[0].decision.why}" in told
+
+
 def test_a_broken_step_is_refused_by_its_name(steps, tmp_path):
     run = written(tmp_path / "run", steps[:1])
     path = run.views[0].folder / "step.npz"

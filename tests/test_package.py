@@ -91,7 +91,7 @@ def test_the_version_is_written_in_one_place_and_cited():
     assert PROJECT["dynamic"] == ["version"]
     cited = (ROOT / "CITATION.cff").read_text()
     fields = re.findall(r"^(?: {4}title|version|.*family-names): (.+)$", cited, re.M)
-    bibtex = re.search(r"```text\n(.*?)```", (ROOT / "README.md").read_text(), re.S)[1]
+    bibtex = re.search(r"```text\n(@.*?)```", (ROOT / "README.md").read_text(), re.S)[1]
     assert caryatid.__version__ in fields
     assert all(text in bibtex for text in fields)
     assert f"## {caryatid.__version__}" in (ROOT / "CHANGELOG.md").read_text()

@@ -654,7 +654,7 @@ class Scene(Pictured):
         self.timings = watch.laps
         found, seconds = self.graph, sum(watch.laps.values())
         counts = len(found.objects), len(found.supports)
-        progress.info("%s: view %d, %d vertices, %d edges, %.2f s", source.name, self.views, *counts, seconds)
+        progress.info("%s: %d vertices, %d edges, %.2f s", source.name, *counts, seconds)
 
     def _named(self, source: View | Cloud) -> bool:
         """Whether a label identifies the same object in all views."""
