@@ -74,7 +74,7 @@ def drawn(page):
         return {node.name: node for nodes in page.drawing.nodes.values() for node in nodes}
 
     yield draw
-    for name, shown in LAYERS.items():
+    for name, (shown, _) in LAYERS.items():
         page.show_layer(name, shown)
     page.wait()
 
@@ -85,7 +85,7 @@ def with_supports(step, *supports):
 
 def test_shapes_and_points_have_their_objects_colours_and_places(step, drawn):
     nodes = drawn(step, chosen="o1")
-    assert {name.split("/")[1] for name in nodes} == set(LAYERS)
+    assert {name.split("/")[1] for name in nodes} == set(LAYERS) - {"gripper"}
     for item in step.graph.objects:
         body = nodes[f"/shapes/{item.id}"]
         assert tuple(body.color) == rgb(object_colour(item.label))
@@ -120,7 +120,7 @@ def test_what_is_hidden_is_not_sent_until_it_is_asked_for(loop):
     loop.turn()
     loop.wait()
     sent = {name.split("/")[0] for name, nodes in loop.drawing.nodes.items() if nodes}
-    assert sent == {"shapes", "names", "supports", "cameras"}
+    assert sent == {"shapes", "names", "supports", "cameras", "grid"}
     loop.show_layer("cloud", True)
     loop.wait()
     assert loop.drawing.nodes["cloud"]
@@ -248,7 +248,7 @@ def test_the_robot_stands_where_it_took_the_view_and_its_way_leads_there(loop):
 
 
 def test_earlier_views_keep_few_points_and_their_cameras_are_not_sent_again(step, settings):
-    page = Page("many", settings.support)
+    page = Page("many", settings)
     cloud = step.cloud.select(np.arange(50_000) % len(step.cloud))
     for k in range(3):
         page.add(replace(step, index=k, cloud=replace(cloud)))
@@ -282,16 +282,12 @@ def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(loop, monkeypatch
             numbers.append((shown_step.index, len(loop.steps) - 1))
 
     monkeypatch.setattr(loop, "stage", stage)
-    if not simulated:
-        loop.source = replace(loop.source, camera=None)
-    loop._running.set()
-    said = loop.clear()
     if simulated:
-        assert said == "Finished: no objects are left; no other object moved."
+        loop._running.set()
+        assert loop.clear() == "Finished: no objects are left; no other object moved."
     else:
-        assert said == "Finished: all objects can be removed safely in the order listed below."
-        assert loop._order.visible
-        assert loop._order.content.index("o2") < loop._order.content.index("o1")
+        loop.plan()
+        loop.play()
     rising = next(
         s for s in shown if s and s.graph["o2"].centre_world[2] > step.graph["o2"].centre_world[2] + 0.01
     )
@@ -302,6 +298,65 @@ def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(loop, monkeypatch
     last = loop.steps[-1] if simulated else shown[-2]
     assert [o.id for o in last.graph.objects] == ["o0"]
     assert [s.lift.object_id for s in loop.steps if s.lift] == (["o2", "o1"] if simulated else [])
+
+
+def check_panels(page):
+    """Find nothing in one panel that another, or the scene, contradicts."""
+    summary, graph, lifts = page._summary.content, page._graph.content, page._lifts.content
+    number, count = (int(n) for n in re.search(r"View (\d+) of (\d+)", summary).groups())
+    assert (number, count) == (page._slider.value, len(page.steps))
+    nodes = {name: [node.name for node in drawn] for name, drawn in page.drawing.nodes.items()}
+    shapes = {name.split("/")[2] for name in nodes["shapes"]}
+    vertices = set(re.findall(r'/object/(\w+)"', graph))
+    assert shapes == vertices
+    objects, supports = (int(n) for n in re.search(r"(\d+) objects?, (\d+) support", summary).groups())
+    assert (objects, supports) == (len(vertices - {"o0"}), len(re.findall(r'class="edge ', graph)))
+    assert {name.split("/")[2] for name in nodes["names"]} == vertices - {"o0"}
+    cameras = {name.partition("/")[2] for name in nodes if name.startswith("cameras/")}
+    assert cameras - {"next"} == {str(k) for k in range(1, number + 1)}
+    assert ("next" in cameras) == ("next</dt>" in summary) != ("finished</dt>" in summary)
+    assert page.steps[number - 1].view.name in page._image.content
+    assert set(page._goal.options[1:]) == vertices - {"o0"}
+
+    chosen = re.search(r"</i><b>(\w+)", page._about.content) if page._about.visible else None
+    bodies = [node for node in page.drawing.nodes["shapes"] if not node.name.endswith("/edges")]
+    faint = {node.name.split("/")[2] for node in bodies if node.opacity < 0.5}
+    assert faint == (vertices - {chosen[1]} if chosen else set())
+
+    planned = re.search(r"Order</b> after view (\d+)", lifts)
+    assert page._play.disabled == ("1. o" not in lifts)
+    assert planned is None or int(planned[1]) == number
+    assert set(re.findall(r"\d+\. (\w+)</dt>", lifts if planned else "")) <= vertices
+    assert ("grasps it" in lifts) == bool(nodes["gripper"])
+
+
+def test_no_panel_contradicts_another_in_fifty_walks_of_clicks(opening, settings):
+    limited = replace(settings, active=replace(settings.active, max_views=3))
+    page, rng = LoopPage(opening, limited, segmentation="labels"), np.random.default_rng(0)
+    page.turn()
+
+    def choose_goal():
+        page._goal.value = str(rng.choice(page._goal.options))
+
+    def choose_gripper():
+        page._gripper.value = str(rng.choice(["none", "franka", "suction"]))
+
+    clicks = [
+        lambda: page.do("taking a view", page.turn),
+        lambda: page.go_to(int(rng.integers(len(page.steps)))),
+        lambda: page.describe(str(rng.choice(["o0", "o1", "o2", ""]))),
+        lambda: page.do("planning an order", page.plan),
+        lambda: page.use_planner(str(rng.choice(["farthest", "support"]))),
+        choose_goal,
+        choose_gripper,
+    ]
+    for _ in range(50):
+        page.do("starting again", page.restart)
+        for click in rng.choice(clicks, 8):
+            click()
+            page.wait()
+            check_panels(page)
+    page.close()
 
 
 # The page
@@ -534,6 +589,7 @@ def test_a_person_goes_on_and_back_chooses_a_view_by_hand_and_clears(seen):
     tab.wait_for_node("/cameras/2")
 
     step = page.steps[-1]
+    tab.page.get_by_text("loop", exact=True).click()
     tab.page.get_by_role("checkbox", name="choose by hand").click()
     client = next(iter(page.server.get_clients().values()))
     centre, radius = step.sphere.centre_world, step.sphere.radius
@@ -555,9 +611,15 @@ def test_a_person_goes_on_and_back_chooses_a_view_by_hand_and_clears(seen):
     assert not np.allclose(taken, step.decision.T_world_camera)
     assert np.linalg.norm(taken[:3, 3] - eye) < 0.2
 
-    page.describe("o2")
+    tab.page.locator('a[href$="/object/o2"]').click()
     tab.wait_for_text("Why a cylinder")
-    tab.press("clear")
+    tab.page.keyboard.press("Escape")
+    tab.page.get_by_text("Why a cylinder").wait_for(state="hidden")
+    tab.page.get_by_text("order", exact=True).click()
+    tab.press("plan order")
+    tab.wait_for_text("Safe order (whole order")
+    page.describe("o2")
+    tab.press("clear the table")
     tab.wait_for_text("Finished: no objects are left; no other object moved.")
     tab.wait_for_node("/shapes/o1", there=False)
     tab.wait_for_node("/shapes/o2", there=False)

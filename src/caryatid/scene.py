@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from caryatid.config import GRIPPERS, Config, GripperConfig, GripperKind, SegmentationMethod
+from caryatid.config import GRIPPERS, Config, GripperConfig, GripperKind, SegmentationMethod, choose_gripper
 from caryatid.errors import CaryatidError, InputError, NoSurfaceError, WrongViewError, check_type
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
@@ -255,8 +255,7 @@ class Scene(Pictured):
             remedy = f"choose one of {', '.join(sorted(names))}"
             raise InputError("gripper", f"'{gripper}' is unknown", remedy)
         if isinstance(gripper, str):
-            kind: Any = gripper
-            gripper = GRIPPERS.get(gripper) or replace(self.config.gripper, kind=kind)
+            gripper = choose_gripper(gripper, self.config.gripper)
         check_type("gripper", gripper, (GripperConfig, NoneType), "give a name or a caryatid.Gripper")
         config = replace(self.config, gripper=gripper or self.config.gripper)
         order: Order = call(

@@ -98,7 +98,7 @@ def _open_run(command: View, folder: Path) -> Page:
             with suppress(InputError), command.output.working("evaluating"):
                 scores = [score.f1 for score in evaluate_run(run)]
         title = f"caryatid: {run.folder.name}"
-        page = Page(title, read_config(run).support, host=command.host, port=command.port)
+        page = Page(title, read_config(run), host=command.host, port=command.port)
         for step in steps:
             page.add(step, scores[step.index] if scores else None)
     return page
@@ -241,7 +241,7 @@ def _watched(name: str, config: Config, output: Output) -> Iterator[Page]:
     from caryatid.viewer.page import Page
 
     sys.setswitchinterval(0.0005)  # As in `view`.
-    page = Page(f"caryatid: {name}", config.support, port=VIEWER_PORT)
+    page = Page(f"caryatid: {name}", config, port=VIEWER_PORT)
     output.say(f"{name} at {page.url}")
     webbrowser.open(page.url)
     try:

@@ -28,7 +28,7 @@ __all__ = [
     "MaskIdentity", "NoiseConfig", "NoiseModel", "OracleConfig", "PhysicsConfig", "PlausibilityConfig",
     "Preset", "RecordingConfig", "RegistrationConfig", "RehearsalConfig", "ReportConfig", "RobotConfig",
     "SegmentationConfig", "SegmentationMethod", "SensorConfig", "SessionConfig", "ShapeKind",
-    "SplitConfig", "SupportConfig", "SurfaceConfig", "VoxelConfig",
+    "SplitConfig", "SupportConfig", "SurfaceConfig", "VoxelConfig", "choose_gripper",
 ]  # fmt: skip
 
 if TYPE_CHECKING:

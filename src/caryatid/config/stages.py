@@ -5,9 +5,9 @@ A value outside its range raises `pydantic.ValidationError`. Values are the pape
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import field, replace
 from math import inf, prod
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
@@ -696,6 +696,12 @@ GRIPPERS: dict[str, GripperConfig] = {
     "robotiq-140": GripperConfig(kind="parallel", opening=0.14),
 }
 """Grippers by name; what is not known of one is as by default."""
+
+
+def choose_gripper(name: str, other: GripperConfig) -> GripperConfig:
+    """Return the gripper of a name in `GRIPPERS`, or another one with the name as its kind."""
+    kind: Any = name
+    return GRIPPERS.get(name) or replace(other, kind=kind)
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

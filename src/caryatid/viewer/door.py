@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
@@ -32,6 +32,8 @@ class Door:
         title: Title of the page.
         host: Address to listen on.
         port: Port to listen on; if taken, the next free one; 0 = any free port.
+        choose: Called with the id of an object whose vertex in the support graph is clicked. viser does not
+            say what is clicked in HTML, so a vertex is a link, and the answer to it is empty.
 
     Attributes:
         server: The `viser.ViserServer`.
@@ -41,7 +43,7 @@ class Door:
         InputError: viser is not installed, or the page cannot be served.
     """
 
-    def __init__(self, title: str, host: str, port: int) -> None:
+    def __init__(self, title: str, host: str, port: int, choose: Callable[[str], None]) -> None:
         with needs_extra("view", "viewer"):
             import uvicorn
             import viser
@@ -56,7 +58,7 @@ class Door:
         with _silent():
             self.server: Any = Server(host=hidden, port=0, label=title, verbose=False)
         pages = Path(viser.__file__).parent / "client" / "build"
-        app = _app(f"ws://{hidden}:{self.server.get_port()}", pages, token, host)
+        app = _app(f"ws://{hidden}:{self.server.get_port()}", pages, token, host, choose)
         options: dict[str, Any] = {"log_level": "critical", "lifespan": "off", "ws_max_size": LARGEST}
         self._front = uvicorn.Server(uvicorn.Config(app, ws_per_message_deflate=False, **options))
         self._thread = Thread(target=self._front.run, args=([listening],), daemon=True)
@@ -97,12 +99,13 @@ def _hidden_address() -> str:
     return hidden
 
 
-def _app(inside: str, pages: Path, token: str, host: str) -> ASGIApp:
+def _app(inside: str, pages: Path, token: str, host: str, choose: Callable[[str], None]) -> ASGIApp:
     """The app: viser's page, and its messages in both directions, for those who may come in."""
     from starlette.applications import Starlette
     from starlette.datastructures import Headers
-    from starlette.responses import PlainTextResponse
-    from starlette.routing import Mount, WebSocketRoute
+    from starlette.requests import Request
+    from starlette.responses import PlainTextResponse, Response
+    from starlette.routing import Mount, Route, WebSocketRoute
     from starlette.staticfiles import StaticFiles
     from starlette.websockets import WebSocket
     from websockets.asyncio.client import connect
@@ -126,7 +129,12 @@ def _app(inside: str, pages: Path, token: str, host: str) -> ASGIApp:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    routes = [WebSocketRoute("/", pass_on), Mount("/", StaticFiles(directory=pages, html=True))]
+    async def click(request: Request) -> Response:
+        choose(request.path_params["object_id"])
+        return Response(status_code=204)
+
+    vertex = Route("/object/{object_id}", click)
+    routes = [vertex, WebSocketRoute("/", pass_on), Mount("/", StaticFiles(directory=pages, html=True))]
     app = Starlette(routes=[WebSocketRoute(f"/{token}", pass_on), Mount(f"/{token}", routes=routes)])
 
     async def guarded(scope: Scope, receive: Receive, send: Send) -> None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from caryatid.config import GripperConfig
 from caryatid.exploration import RobotPose, Step
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SupportGraph
+from caryatid.graph import Grasp, SupportGraph, TakeStep
+from caryatid.manipulation.grasps import gripper_boxes, turn_of
 from caryatid.planning.decision import Decision
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
@@ -23,10 +25,18 @@ from caryatid.viz.scene_3d import support_ends
 from caryatid.viz.tables import count_of
 
 LAYERS = {
-    "shapes": True, "names": True, "supports": True, "cameras": True,
-    "cloud": False, "sphere": False, "interest": False, "robot": False,
-}  # fmt: skip
-"""Layers that can be shown and hidden, and whether they are visible at first."""
+    "shapes": (True, "Fitted shapes"),
+    "names": (True, "Ids of the objects"),
+    "supports": (True, "What supports what, as arrows"),
+    "cameras": (True, "Where the views were taken, and the next"),
+    "gripper": (True, "How the gripper takes the first object of the order, or the one chosen"),
+    "grid": (True, "10 cm under the support surface, and the axes of the world"),
+    "cloud": (False, "The points of all views"),
+    "sphere": (False, "Where the camera can go; red = worth looking from"),
+    "interest": (False, "What is worth looking at, and from where"),
+    "robot": (False, "Where the robot stood, and the way it came"),
+}
+"""Layers that can be shown and hidden: whether they are visible at first, and what they show."""
 SURE, DOUBTFUL = (26, 32, 40), (196, 78, 12)
 """Colours of supports; doubtful ones are dashed too."""
 EARLIER, NEXT, BY_HAND = (128, 136, 146), (11, 92, 148), (170, 30, 120)
@@ -46,9 +56,11 @@ MATT: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 def reduced(step: Step) -> Step:
     """The step reduced to what is drawn of it, so that the page can keep every step."""
     view, cloud, candidates, decision = step.view, step.cloud, step.candidates, step.decision
+    labels = step.labels[:0]
     if view is not None:
-        view = replace(view, labels=None, normals_camera=None, ignored=None)
-        view = view.every(max(1, view.depth.shape[1] // 240))
+        every = max(1, view.depth.shape[1] // 320)
+        view = replace(view, labels=None, normals_camera=None, ignored=None).every(every)
+        labels = np.ascontiguousarray(step.labels[::every, ::every])
     points: Any = cloud.points_world.astype(np.float32)
     cloud = replace(cloud, points_world=points, normals_world=np.zeros(points.shape, np.int8))
     upper = step.sphere.directions[step.sphere.directions[:, 2] > 0.0]
@@ -58,7 +70,7 @@ def reduced(step: Step) -> Step:
         candidates = replace(candidates, T_world_camera=none, path_length=none[:, 0, 0], indices=None)
     if decision is not None:
         decision = replace(decision, sphere_saliency=None)
-    drawn = replace(step, view=view, labels=step.labels[:0], cloud=cloud)
+    drawn = replace(step, view=view, labels=labels, cloud=cloud)
     return replace(drawn, sphere=sphere, candidates=candidates, decision=decision)
 
 
@@ -79,6 +91,30 @@ def step_of_scene(scene: Scene) -> Step:
     return Step(scene.views - 1, name, None, labels, *known, None, None, {}, 0.0, 0.0, None)
 
 
+def without(step: Step, gone: Collection[str], lifted: str, T_world_world: Mapping[str, Array]) -> Step:
+    """A step as it looks while an object is being lifted and others are gone.
+
+    Shapes that have moved leave their points behind, and so their points are not shown.
+    """
+    graph, cloud, still = step.graph, step.cloud, np.eye(4)
+    objects = tuple(
+        replace(o, shape=o.shape.moved(T_world_world.get(o.id, still)))
+        for o in graph.objects
+        if o.id not in gone
+    )
+    supports = tuple(
+        replace(s, contact_world=None, normal_world=None)
+        for s in graph.supports
+        if not {s.supporter, s.supported} & {lifted, *gone}
+    )
+    moved = {i for i, T in T_world_world.items() if np.abs(T - still).max() > 2e-3}
+    away = [o.label for o in graph.objects if o.id in {*gone, *moved}]
+    if away and cloud.labels is not None:
+        cloud = cloud.select(~np.isin(cloud.labels, away))
+    shown = replace(graph, objects=objects, supports=supports)
+    return replace(step, graph=shown, cloud=cloud, decision=None, candidates=None)
+
+
 class SceneDrawing:
     """The page's scene; a layer is sent when it is shown, and again only when what it shows has changed.
 
@@ -93,7 +129,7 @@ class SceneDrawing:
     def __init__(self, server: Any, clicked: Callable[[str], None]) -> None:
         self._server, self._scene, self._clicked = server, server.scene, clicked
         self._frames = {name: self._scene.add_frame(f"/{name}", show_axes=False) for name in LAYERS}
-        for name, shown in LAYERS.items():
+        for name, (shown, _) in LAYERS.items():
             self._frames[name].visible = shown
         self._shown: dict[str, tuple[object, ...]] = {}
         self.nodes: dict[str, list[Any]] = {name: [] for name in LAYERS}
@@ -108,19 +144,27 @@ class SceneDrawing:
         steps: Sequence[Step],
         *,
         chosen: str = "",
+        lift: TakeStep | None = None,
+        gripper: GripperConfig | None = None,
         point_size: float = 0.003,
         true_colours: bool = False,
     ) -> None:
         """Show a step, with the cameras of all steps so far, in place of the one before.
 
-        An object may stand out; points have a diameter [m], and their objects' colours or their own.
+        An object may stand out, and a gripper may be at a lift's grasp; points have a diameter [m], and their
+        objects' colours or their own.
         """
         decision = step.decision
+        surfaces = np.concatenate(
+            [np.zeros((0, 3)), *(o.shape.outline() for o in step.graph.support_surfaces)]
+        )
         layers: dict[str, tuple[object, ...]] = {
             "cloud": (step.cloud, point_size, true_colours),
             "shapes": (step.graph, chosen if any(o.id == chosen for o in step.graph.objects) else ""),
             "names": (step.graph,),
             "supports": (step.graph,),
+            "gripper": (None if lift is None else lift.grasp, gripper),
+            "grid": (min(surfaces[:, 2], default=0.0), max(surfaces[:, 2], default=0.0) + 0.002),
             "sphere": (step.sphere, step.candidates, decision),
             "interest": (step.sphere, decision),
             "robot": (step.robot, steps[-2] if len(steps) > 1 else None),
@@ -205,6 +249,26 @@ class SceneDrawing:
     def _lines(self, name: str, ends: Array, colours: Any, **look: Any) -> list[Any]:
         """Line segments (N, 2, 3), if there are any."""
         return [self._scene.add_line_segments(name, ends, colours, **look)] if len(ends) else []
+
+    def _gripper(self, grasp: Grasp | None, gripper: GripperConfig | None) -> list[Any]:
+        """The gripper at a grasp."""
+        if grasp is None or gripper is None:
+            return []
+        T_world_boxes, nodes = grasp.T_world_gripper @ transforms.invert(turn_of(gripper)), []
+        for number, (low, high) in enumerate(gripper_boxes(gripper, grasp.width)):
+            place = T_world_boxes @ transforms.rigid(np.eye(3), (low + high) / 2.0)
+            look: dict[str, Any] = {"dimensions": tuple(high - low), "opacity": 0.7} | _pose(place) | MATT
+            nodes.append(self._scene.add_box(f"/gripper/part {number}", color=EARLIER, **look))
+        return nodes
+
+    def _grid(self, height: float, top: float) -> list[Any]:
+        """A grid below everything, and the world's x and y axes at the height of the surface."""
+        look: dict[str, Any] = {"width": 4.0, "height": 4.0, "cell_size": 0.1, "section_size": 0.5}
+        look |= {"cell_color": (234, 236, 238), "section_color": (214, 217, 221), "shadow_opacity": 0.0}
+        grid = self._scene.add_grid("/grid/lines", position=(0.0, 0.0, height - 0.001), **look)
+        axes = np.array([(0.0, 0.0, top)] * 2 + [(0.1, 0.0, top), (0.0, 0.1, top)]).reshape(2, 2, 3)
+        colours = np.array([[(200, 40, 40)] * 2, [(40, 140, 40)] * 2], dtype=np.uint8)
+        return [grid, *self._lines("/grid/axes", axes.swapaxes(0, 1), colours, **SCREEN)]
 
     def _supports(self, graph: SupportGraph) -> list[Any]:
         """Arrows from centre to centre, which show through the shapes; of surfaces only if doubtful."""

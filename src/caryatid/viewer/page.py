@@ -4,44 +4,58 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from html import escape
-from threading import RLock
-from typing import Any
+from threading import Event, RLock
+from typing import Any, get_args
 
 import numpy as np
 
-from caryatid.config import SupportConfig
-from caryatid.errors import InputError
+from caryatid.config import GRIPPERS, Config, GripperConfig, GripperKind, choose_gripper
+from caryatid.errors import CaryatidError, InputError, in_one_line
 from caryatid.exploration import Step
-from caryatid.graph import SupportGraph
+from caryatid.geometry import transforms
+from caryatid.graph import SupportGraph, TakeStep
+from caryatid.manipulation.order import Order, plan_order
 from caryatid.objects.reasons import Reasons
+from caryatid.runtime.parallel import cores
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import direction
-from caryatid.support.relations import removal_of
 from caryatid.viewer.door import Door
-from caryatid.viewer.drawing import LAYERS, NEXT, SceneDrawing, reduced, step_of_scene, thinned
-from caryatid.viz.colours import SALIENCY_STOPS, object_colour, scale
+from caryatid.viewer.drawing import LAYERS, NEXT, SceneDrawing, reduced, step_of_scene, thinned, without
+from caryatid.viewer.panels import (
+    IMAGES,
+    describe_lifts,
+    describe_object,
+    describe_signs,
+    describe_view,
+    draw_linked_graph,
+    draw_view,
+)
 from caryatid.viz.drawings import draw_chart
-from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.notebook import cell_html
-from caryatid.viz.pictures import Picture, raster
 from caryatid.viz.report import Figure, Section
-from caryatid.viz.tables import census, noticed, object_table, support_table
+
+ALL = "all objects"
+"""Goal of an order that removes everything."""
 
 
 class Page:
     """A viewer in the browser, served by this process.
 
     Steps are added from any thread and drawn in the page's thread; if they arrive faster than they can be
-    drawn, only the newest is drawn.
+    drawn, only the newest is drawn. What is shown follows from the steps, the view and the object chosen, and
+    the last order; all panels change together.
 
     Args:
         title: Title of the page.
-        support: Settings with which the graphs were inferred, to predict which objects move.
+        config: Settings of the run, to predict which objects move and to plan orders.
         host: Address to listen on; on 127.0.0.1, only programs on this machine can connect.
         port: Port to listen on; if taken, the next free one; 0 = any free port.
+        seed: Seed of the rehearsals of orders.
         small: Fold the panels at first, for a small page such as in a notebook.
 
     Attributes:
@@ -60,24 +74,27 @@ class Page:
     def __init__(
         self,
         title: str,
-        support: SupportConfig | None = None,
+        config: Config | None = None,
         *,
         host: str = "127.0.0.1",
         port: int = 0,
+        seed: int = 0,
         small: bool = False,
     ) -> None:
         self.working = RLock()
-        self._door = Door(title, host, port)
+        self._door = Door(title, host, port, self.describe)
         self.server, self.url = self._door.server, self._door.url
         self.steps: list[Step] = []
         self.scores: list[float | None] = []
         self.why: Callable[[str], Reasons] | None = None
         self.drawing = SceneDrawing(self.server, self.describe)
-        self._support, self._small = support or SupportConfig(), small
+        self._config, self._seed, self._small = config or Config(), seed, small
         self._shown, self._chosen = -1, ""
         self._staged: Step | None = None
-        self._drawer = ThreadPoolExecutor(1, "viewer")
+        self._planned: tuple[SupportGraph, Order, GripperConfig] | None = None
+        self._drawer, self._worker = ThreadPoolExecutor(1, "viewer"), ThreadPoolExecutor(1, "loop")
         self._pending: Future[None] | None = None
+        self._busy, self._running, self._playing = False, Event(), Event()
         self._build()
 
     def say(self, text: str) -> None:
@@ -98,6 +115,11 @@ class Page:
             self._look_at(step)
         self.redraw()
 
+    def forget(self) -> None:
+        """Forget all steps, to begin again."""
+        self.steps, self.scores = [], []  # Others may still be drawn.
+        self._shown, self._chosen, self._staged, self._planned = -1, "", None, None
+
     def update(self, scene: Scene) -> None:
         """Add the current state of a scene; the slider goes back to earlier states."""
         if scene.views:
@@ -114,20 +136,82 @@ class Page:
         """Show the scene after a view."""
         index = min(max(index, 0), len(self.steps) - 1)
         if index != self._shown:
+            self._playing.clear()
             self._shown = index
             self._staged = None
             self.redraw()
 
     def describe(self, object_id: str) -> None:
-        """Show the details of an object."""
-        self._chosen = object_id
+        """Show the details of an object; again, or with an empty id, those of none."""
+        self._chosen = "" if object_id == self._chosen else object_id
         self.redraw()
 
     def stage(self, step: Step | None) -> None:
-        """Show a step without adding it; None returns to the added steps."""
+        """Show a step in place of the view shown, if it is of that view; None returns to what was added."""
+        if step is not None and step.index != self._shown:
+            step = None  # The user looks at another view.
         if step is not self._staged:
             self._staged = step
             self.redraw()
+
+    def do(self, what: str, work: Callable[[], str | None]) -> None:
+        """Queue work, and show the message that it returns."""
+
+        def done() -> None:
+            self._show_state(what + " …", busy=True)
+            try:
+                said = work()
+            except CaryatidError as error:
+                said = f"{error}"
+            except Exception as error:
+                said = in_one_line(error)
+            self._running.clear()
+            self._show_state(said or "", busy=False)
+
+        with contextlib.suppress(RuntimeError):  # The page is being closed.
+            self._worker.submit(done)
+
+    def plan(self) -> str:
+        """Plan an order from the graph of the view shown, with the gripper and goal chosen; return a message.
+
+        Raises:
+            CaryatidError: There is nothing to lift.
+        """
+        graph, goal = self.steps[self._shown].graph, None if self._goal.value == ALL else self._goal.value
+        gripper = choose_gripper(self._gripper.value, self._config.gripper)
+        config = replace(self._config, gripper=gripper)
+        with self.working:
+            order = plan_order(graph, config, goal=goal, seed=self._seed, threads=cores())
+        self._planned = graph, order, gripper
+        return ""
+
+    def play(self) -> str:
+        """Show the lifts of the order one after the other, until another view is chosen; return a message."""
+        step, gone = self.steps[self._shown], set[str]()
+        if self._planned is None or self._planned[0] is not step.graph:
+            return ""
+        rising = [transforms.rigid(np.eye(3), (0.0, 0.0, height)) for height in np.linspace(0.0, 0.5, 8)[1:]]
+        self._playing.set()
+        for lift in self._planned[1].steps:
+            self._show(without(step, gone, lift.object_id, {lift.object_id: T}) for T in rising)
+            gone.add(lift.object_id)
+            self._show([without(step, gone, lift.object_id, {})])
+        self._playing.clear()
+        self.stage(None)
+        return ""
+
+    def _show(self, film: Iterable[Step]) -> None:
+        for picture in film:
+            if self._playing.is_set():
+                self.stage(picture)
+                time.sleep(0.12)  # Time for which each picture of a lift is shown [s].
+
+    def _show_state(self, text: str, *, busy: bool) -> None:
+        self._busy = busy
+        self._bar.visible = busy
+        self._plan.disabled = busy
+        self.say(text)
+        self.redraw()
 
     def in_turn(self, steps: Iterator[Step]) -> Iterator[Step]:
         """Compute steps one by one, each while this page computes nothing."""
@@ -146,13 +230,18 @@ class Page:
                 self._pending.add_done_callback(_log_failure)
 
     def wait(self) -> None:
-        """Wait until everything is drawn, and raise drawing errors."""
+        """Wait until all requests are done and everything is drawn, and raise drawing errors."""
+        self._worker.submit(lambda: None).result()
         self._drawer.submit(lambda: None).result()
         if self._pending is not None:
             self._pending.result()
 
     def close(self) -> None:
-        """Stop serving the page."""
+        """Finish the current work, then stop serving the page."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
+        self._running.clear()
+        self._playing.clear()
+        self._worker.shutdown()
         self._drawer.shutdown(wait=True, cancel_futures=True)
         self._door.close()
 
@@ -165,37 +254,70 @@ class Page:
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=NEXT)
         self.server.scene.set_up_direction("+z")
         self._notice = gui.add_html("", order=-20, visible=False)
+        self._bar = gui.add_progress_bar(100, animated=True, order=-19, visible=False)
         hint = "Go back to an earlier view"
         # Without an order, a later page of the same process would have it below the layers.
         self._slider = gui.add_slider("view", 1, 2, 1, 1, order=0, visible=False, hint=hint)
-        self._slider.on_update(lambda _: self.go_to(int(self._slider.value) - 1))
-        self._summary = gui.add_html("", order=1)
-        self._boxes: dict[str, Any] = {}
-        with gui.add_folder("show", order=90):
-            for name, shown in LAYERS.items():
-                box = self._boxes[name] = gui.add_checkbox(name, shown)
-                box.on_update(lambda event, name=name: self.show_layer(name, event.target.value))
-            self._true_colours = gui.add_checkbox("camera colours", False)
-            self._size = gui.add_slider("point size [mm]", 1.0, 12.0, 0.5, 3.0)
-        for control in (self._true_colours, self._size):
-            control.on_update(lambda _: self.redraw())
-        panel, about = gui.add_panel(), gui.add_panel()
+        self._slider.on_update(self._slide)
+        self._about = gui.add_html("", order=1, visible=False)
+        self._summary = gui.add_html("", order=2)
+        panel = gui.add_panel()
         with panel.add_tab("supports"):
             self._graph = gui.add_html("")
+        with panel.add_tab("order"):
+            self._build_order()
+        with panel.add_tab("image"):
+            self._kind = gui.add_dropdown("show", [*IMAGES], hint="What to show of the view's image")
+            self._image = gui.add_html("")
         with panel.add_tab("F1"):
             self._chart = gui.add_html(cell_html(Section("", "No ground truth available.")))
+        with panel.add_tab("scene"):
+            self._build_layers()
         with panel.add_tab("key"):
-            gui.add_html(_describe_signs())
-        with about.add_tab("object"):
-            hint = "Click an object in the scene to see its details."
-            self._about = gui.add_html(cell_html(Section("", hint)))
-        panel.dock_left()
-        panel.set_width(380)
-        about.dock_below(panel)
+            gui.add_html(describe_signs())
+        for control in (self._kind, self._true_colours, self._size):
+            control.on_update(lambda _: self.redraw())
+        gui.add_command("Deselect the object", hotkey="escape").on_trigger(lambda _: self.describe(""))
+        for key, way in (("pageup", -1), ("pagedown", 1)):
+            command = gui.add_command("Earlier view" if way < 0 else "Later view", hotkey=key)
+            command.on_trigger(lambda _, way=way: self.go_to(self._shown + way))
+        self.server.scene.on_click()(self._point)
         if self._small:
             panel.minimize()
         else:
             gui.main_panel.dock_right()
+            gui.main_panel.set_width(400)
+            panel.dock_below(gui.main_panel)
+
+    def _build_order(self) -> None:
+        gui, grippers = self.server.gui, [*get_args(GripperKind), *GRIPPERS]
+        chosen = self._config.gripper.kind
+        hint = "The gripper that lifts; with none, every object can be grasped"
+        self._gripper = gui.add_dropdown("gripper", grippers, initial_value=chosen, hint=hint)
+        hint = "Reach one object, and remove only what is in its way"
+        self._goal = gui.add_dropdown("goal", [ALL], hint=hint)
+        hint = "Find what to lift first, and then next, so that nothing else moves"
+        self._plan = gui.add_button("plan order", hint=hint)
+        self._play = gui.add_button("play", disabled=True, hint="Show the lifts one after the other")
+        hint = "Look until a lift is safe, remove the object, look again, until the table is empty"
+        self._clear = gui.add_button("clear the table", hint=hint, visible=False)
+        self._lifts = gui.add_html("")
+        self._plan.on_click(lambda _: self.do("planning an order", self.plan))
+        self._play.on_click(lambda _: self.do("showing the lifts", self.play))
+
+    def _build_layers(self) -> None:
+        gui = self.server.gui
+        self._boxes: dict[str, Any] = {}
+        hint = "Move your eye to where it began, above the objects, or into the camera of the view shown"
+        look = gui.add_button_group("look from", ("start", "above", "camera"), hint=hint)
+        look.on_click(lambda event: self._look_from(event.target.value, event.client.camera))
+        for name, (shown, hint) in LAYERS.items():
+            box = self._boxes[name] = gui.add_checkbox(name, shown, hint=hint)
+            box.on_update(lambda event, name=name: self.show_layer(name, event.target.value))
+        self._true_colours = gui.add_checkbox(
+            "camera colours", False, hint="Colour points as cameras saw them"
+        )
+        self._size = gui.add_slider("point size [mm]", 1.0, 12.0, 0.5, 3.0)
 
     def _look_at(self, step: Step) -> None:
         """Place the initial viewpoint in front of the objects, beside the first camera."""
@@ -210,45 +332,91 @@ class Page:
         camera.fov = 0.72  # Narrow, so that near objects do not hide far ones [rad].
         camera.position = centre + 3.2 * reach * direction(azimuth, 0.55)  # From 3.2 radii, all objects fit.
 
+    def _look_from(self, where: str, eye: Any) -> None:
+        """Move a browser's eye."""
+        start = self.server.initial_camera
+        position, target, up, fov = start.position, start.look_at, np.array([0.0, 0.0, 1.0]), start.fov
+        view = self.steps[self._shown].view if self.steps else None
+        if where == "above":
+            away = position - target
+            position = target + np.linalg.norm(away) * transforms.unit(0.02 * away + (0.0, 0.0, 1.0))
+        elif where == "camera" and view is not None and view.T_world_camera is not None:
+            R, position = view.T_world_camera[:3, :3], view.T_world_camera[:3, 3]
+            target, up = position + np.linalg.norm(target - position) * R[:, 2], -R[:, 1]
+            fov = 2.0 * float(np.arctan2(view.depth.shape[0] / 2.0, view.K[1, 1]))
+        eye.up_direction, eye.position, eye.look_at, eye.fov = up, position, target, fov
+
+    def _slide(self, event: Any) -> None:
+        """Show the view that a person chose; drawing moves the slider too, and later views may have come."""
+        if event.client is not None:
+            self.go_to(int(event.target.value) - 1)
+
+    def _point(self, event: Any) -> None:
+        """Deselect the object if a click meets none."""
+        origin, along = np.array(event.ray_origin), transforms.unit(np.array(event.ray_direction))
+        ray = origin + np.arange(0.0, 5.0, 0.002)[:, None] * along  # All that one can click at is within 5 m.
+        shown = self._staged or (self.steps[self._shown] if self.steps else None)
+        # Within 4 mm of a shape, the click may have met it.
+        if shown is None or all(o.shape.signed_distance(ray).min() > 0.004 for o in shown.graph.objects):
+            self.describe("")
+
     def _draw(self) -> None:
-        steps, scores, chosen = self.steps[: self._shown + 1], [*self.scores], self._chosen
+        known, scores, chosen = self.steps, [*self.scores], self._chosen
+        steps = known[: self._shown + 1]
         if not steps:
             return
-        step, f1 = steps[-1], scores[self._shown]
+        step, f1, count, number = steps[-1], scores[len(steps) - 1], len(known), len(steps)
         if self._staged is not None:
             step, f1 = self._staged, None
-        count, graph = len(self.steps), step.graph
+        graph = step.graph
         before = steps[-2] if len(steps) > 1 else None
-        texts = [(self._summary, describe_view(step, f1, count, before))]
-        drawn = Figure("", draw_graph(graph, compact=True))
-        texts.append((self._graph, cell_html(Section("", figures=[drawn]))))
+        lifts = [each.lift for each in steps if each.lift is not None]
+        order, gripper = None, None
+        if self._planned is not None and self._planned[0] is steps[-1].graph:
+            _, order, gripper = self._planned
+        lift = None if order is None or self._staged is not None else _lift_of(order, chosen)
+        drawn = draw_linked_graph(graph, chosen, f"/{self.url.rpartition('/')[2]}/object")
+        texts = [
+            (self._summary, describe_view(step, f1, count, before)), (self._graph, drawn),
+            (self._lifts, describe_lifts(order, lifts, number)),
+            (self._image, draw_view(steps[-1], self._kind.value)),
+        ]  # fmt: skip
         if any(f1 is not None for f1 in scores):
-            known = [np.nan if f1 is None else f1 for f1 in scores]
-            chart = Figure("", draw_chart("F1 after each view", "F1", {"F1": known}, top=1.0))
+            values = [np.nan if f1 is None else f1 for f1 in scores]
+            chart = Figure("", draw_chart("F1 after each view", "F1", {"F1": values}, top=1.0))
             texts.append((self._chart, cell_html(Section("", figures=[chart]))))
         if chosen:
             with self.working:
-                gone = {each.lift.object_id for each in steps if each.lift is not None}
-                taken = chosen in gone | {o.id for o in steps[-1].graph.objects}
+                taken = chosen in {lift.object_id for lift in lifts} | {o.id for o in steps[-1].graph.objects}
                 why = self._reasons_of(chosen, step)
-                text = describe_object(graph, chosen, self._support, taken=taken, reasons=why)
+                text = describe_object(graph, chosen, self._config.support, taken=taken, reasons=why)
                 texts.append((self._about, text))
         look = {"point_size": self._size.value / 1000.0, "true_colours": self._true_colours.value}
         # Scene and texts change together.
         with self.server.atomic():
-            self.drawing.show(step, steps, chosen=chosen, **look)
+            self.drawing.show(step, steps, chosen=chosen, lift=lift, gripper=gripper, **look)
             self._slider.visible = count > 1
             self._slider.max = max(count, 2)
-            self._slider.value = self._shown + 1
+            self._slider.value = number
+            self._about.visible = bool(chosen)
+            self._play.disabled = self._busy or order is None or not order.steps
+            goals = (ALL, *(o.id for o in steps[-1].graph.objects if o.role == "object"))
+            if self._goal.options != goals:
+                self._goal.options = goals
             for panel, text in texts:
                 panel.content = text
 
     def _reasons_of(self, object_id: str, step: Step) -> Reasons | None:
         """Why an object has its shape after a step; None if that is unknown."""
-        if self.why is not None and step is self.steps[-1]:
+        if self.why is not None and self.steps and step is self.steps[-1]:
             with contextlib.suppress(InputError):
                 return self.why(object_id)
         return next((reasons for reasons in step.reasons if reasons.subject == (object_id,)), None)
+
+
+def _lift_of(order: Order, chosen: str) -> TakeStep | None:
+    """The lift of the chosen object, or else the first of an order."""
+    return next((step for step in order.steps if step.object_id == chosen), next(iter(order.steps), None))
 
 
 def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
@@ -265,80 +433,9 @@ def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
     Raises:
         InputError: viser is not installed.
     """
-    page = Page("caryatid", scene.config.support, host=host, port=port, small=True)
+    page = Page("caryatid", scene.config, host=host, port=port, seed=scene.seed, small=True)
     page.update(scene)
     return page
-
-
-# Texts beside the scene
-
-
-def describe_view(step: Step, f1: float | None, count: int, before: Step | None = None) -> str:
-    """Describe the scene after a view, what happened since the step before, and what comes next."""
-    facts = [] if f1 is None else [("F1", f"{f1:.3f}")]
-    facts += [(change.kind, f"{change.object_id}: {change.why}") for change in noticed(before, step)]
-    if step.removal is not None:
-        facts.append((f"without {step.removal.object_id}", str(step.removal)))
-    if step.lift is not None:
-        facts.append(("removed", f"{step.lift.object_id}: {step.lift.why}"))
-    if step.stop is not None:
-        facts.append(("finished", step.stop))
-    elif step.decision is not None:
-        facts.append(("next", step.decision.why))
-    return cell_html(Section(f"View {step.index + 1} of {count}", census(step.graph), facts=facts))
-
-
-def _describe_signs() -> str:
-    """Explain the symbols in the scene."""
-    signs = {
-        "Arrow": "supporter → supported; thicker = more probable, dashed = doubtful. "
-        "Supports by a support surface are drawn only if doubtful",
-        "Number on an arrow": "probability of the support, if below 1",
-        "Coloured dots on the sphere": "candidate views that the robot can reach, coloured by saliency",
-        "Fine grey dots": "views out of reach",
-        "Balls with rays": "points of interest, and the views that show them best",
-        "Grey robot": "where it stands, and as a line on the floor, the way it came",
-        "Grey cameras": "earlier views with their images; the newest is black and larger",
-        "Filled camera": "next view: blue = chosen by the planner, pink = chosen by hand",
-    }
-    bar = scale(np.tile(np.linspace(-1.0, 1.0, 340), (10, 1)), SALIENCY_STOPS)
-    picture = Picture("saliency", 340.0, 10.0, [raster(bar, 0.0, 0.0, 340.0, 10.0)])
-    caption = "Saliency: from low (already seen) to high (look here); the maximum of each view is red."
-    return cell_html(Section("Key", facts=[*signs.items()], figures=[Figure("", picture, caption)]))
-
-
-def describe_object(
-    graph: SupportGraph,
-    object_id: str,
-    config: SupportConfig,
-    *,
-    taken: bool = False,
-    reasons: Reasons | None = None,
-) -> str:
-    """Describe an object: its edges, what moves without it, size, fit and reasons; or that it was removed."""
-    item = next((o for o in graph.objects if o.id == object_id), None)
-    if item is None:
-        return cell_html(Section(object_id, "was removed" if taken else "not found up to this view"))
-    facts = []
-    for supporter, supported, kind, likely, found, why in support_table(graph).rows:
-        if item.title in (supporter.text, supported.text):
-            evidence = f"{kind.text}, probability {likely.text}, {found.text} views; {why.text}"
-            facts.append((f"{supporter.text} → {supported.text}", evidence))
-    if item.role == "object":
-        removal = removal_of(graph, object_id, config)
-        moves = [f"{e.object_id} moves with probability {e.probability:.2f}: {e.why}" for e in removal.moving]
-        moves.append(f"nothing else moves with probability {removal.rest:.2f}")
-        facts += [(f"Without {object_id}", text) for text in moves]
-    table = object_table(graph)
-    (row,) = (row for row in table.rows if row[0].text == item.title)
-    facts += [(name, e.text) for name, e in zip(table.columns, row, strict=True) if e.text][2:]
-    if reasons is not None:
-        chosen, *others = reasons.options
-        terms = {"points": chosen.points, "free space": chosen.free, "parameters": chosen.parameters}
-        cost = ", ".join(f"{name} {nats:.0f}" for name, nats in terms.items())
-        facts.append((f"Why {chosen.what}", f"it costs {chosen.total:.0f} nats: {cost}"))
-        facts += [(f"{o.what} instead", f"{o.total - chosen.total:+.0f} nats") for o in others]
-    return cell_html(Section(item.title, item.shape.kind, facts=facts, colour=object_colour(item.label)))
 
 
 def _log_failure(drawn: Future[None]) -> None:

@@ -46,7 +46,8 @@ class Picture:
 
 def picture_svg(picture: Picture) -> str:
     """Return a picture as an SVG element that stands inside an HTML page."""
-    look = {"role": "img", "aria_label": picture.name, "font_family": "system-ui, DejaVu Sans, sans-serif"}
+    role = "group" if any(part.tag == "a" for part in picture.parts) else "img"  # An image has no links.
+    look = {"role": role, "aria_label": picture.name, "font_family": "system-ui, DejaVu Sans, sans-serif"}
     root = element("svg", viewBox=f"0 0 {picture.width:g} {picture.height:g}", **look)
     root.extend(picture.parts)
     return tostring(root, encoding="unicode")

@@ -1,0 +1,162 @@
+"""What stands beside the scene: texts, the support graph, the image of a view, and removal orders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from caryatid.config import SupportConfig
+from caryatid.exploration import Step
+from caryatid.graph import SupportGraph, TakeStep
+from caryatid.manipulation.order import Order
+from caryatid.objects.reasons import Reasons
+from caryatid.sensing.views import View
+from caryatid.support.relations import removal_of
+from caryatid.viz.colours import SALIENCY_STOPS, object_colour, scale
+from caryatid.viz.drawings import draw_image, image_of
+from caryatid.viz.graph_drawing import draw_graph
+from caryatid.viz.notebook import cell_html
+from caryatid.viz.pictures import Picture, element, raster
+from caryatid.viz.report import Figure, Section
+from caryatid.viz.tables import census, noticed, object_table, order_line, support_table
+
+WIDTH = 380
+"""Of pictures in a panel [px]."""
+
+
+def describe_view(step: Step, f1: float | None, count: int, before: Step | None = None) -> str:
+    """Describe the scene after a view, what happened since the step before, and what comes next."""
+    facts = [] if f1 is None else [("F1", f"{f1:.3f}")]
+    facts += [(change.kind, f"{change.object_id}: {change.why}") for change in noticed(before, step)]
+    if step.removal is not None:
+        facts.append((f"without {step.removal.object_id}", str(step.removal)))
+    if step.lift is not None:
+        facts.append(("removed", f"{step.lift.object_id}: {step.lift.why}"))
+    if step.stop is not None:
+        facts.append(("finished", step.stop))
+    elif step.decision is not None:
+        facts.append(("next", step.decision.why))
+    return cell_html(Section(f"View {step.index + 1} of {count}", census(step.graph), facts=facts))
+
+
+def describe_object(
+    graph: SupportGraph,
+    object_id: str,
+    config: SupportConfig,
+    *,
+    taken: bool = False,
+    reasons: Reasons | None = None,
+) -> str:
+    """Describe an object: its edges, what moves without it, size, fit and reasons; or that it was removed."""
+    item = next((o for o in graph.objects if o.id == object_id), None)
+    if item is None:
+        return cell_html(Section(object_id, "was removed" if taken else "not found up to this view"))
+    facts = []
+    for supporter, supported, kind, likely, found, why in support_table(graph).rows:
+        if item.title in (supporter.text, supported.text):
+            evidence = f"{kind.text}, probability {likely.text}, {found.text} views; {why.text}"
+            facts.append((f"{supporter.text} → {supported.text}", evidence))
+    if item.role == "object":
+        removal = removal_of(graph, object_id, config)
+        moves = [f"{e.object_id} moves with probability {e.probability:.2f}: {e.why}" for e in removal.moving]
+        moves.append(f"nothing else moves with probability {removal.rest:.2f}")
+        facts = [(f"Without {object_id}", text) for text in moves] + facts
+    table = object_table(graph)
+    (row,) = (row for row in table.rows if row[0].text == item.title)
+    facts += [(name, e.text) for name, e in zip(table.columns, row, strict=True) if e.text][2:]
+    if reasons is not None:
+        chosen, *others = reasons.options
+        terms = {"points": chosen.points, "free space": chosen.free, "parameters": chosen.parameters}
+        cost = ", ".join(f"{name} {nats:.0f}" for name, nats in terms.items())
+        facts.append((f"Why {chosen.what}", f"it costs {chosen.total:.0f} nats: {cost}"))
+        facts += [(f"{o.what} instead", f"{o.total - chosen.total:+.0f} nats") for o in others]
+    return cell_html(Section(item.title, item.shape.kind, facts=facts, colour=object_colour(item.label)))
+
+
+def describe_lifts(order: Order | None, lifts: Sequence[TakeStep], view: int) -> str:
+    """Describe an order planned from the graph after a view, if there is one, and the lifts made so far."""
+
+    def told(steps: Sequence[TakeStep]) -> list[tuple[str, str]]:
+        return [(f"{number}. {s.object_id}", _describe_lift(s)) for number, s in enumerate(steps, start=1)]
+
+    parts = []
+    if lifts:
+        parts.append(cell_html(Section("Removed so far", facts=told(lifts))))
+    if order is None:
+        hint = "Plan an order to see what to lift first, and how surely nothing else moves."
+        parts.append(cell_html(Section("", hint)))
+    else:
+        line = order_line(order)
+        text = f"after view {view}: {line[0].upper()}{line[1:]}."
+        facts = [*told(order.steps), *([("Refused", order.refusal)] if order.refusal else [])]
+        parts.append(cell_html(Section("Order", text, facts=facts)))
+    return "".join(parts)
+
+
+def _describe_lift(step: TakeStep) -> str:
+    held = f"hold {', '.join(step.hold)}; " if step.hold else ""
+    return f"{1.0 - step.risk:.0%}{'' if step.safe else ', too low'}; {held}{step.why}"
+
+
+def draw_linked_graph(graph: SupportGraph, chosen: str, address: str) -> str:
+    """Draw the support graph, its vertices linked to an address; all but the chosen one are faint."""
+    picture, parts = draw_graph(graph, compact=True), []
+    for part in picture.parts:
+        kind, *names = part.get("class", "note").split()
+        if kind in ("node", "edge") and chosen and chosen not in names:
+            part.set("opacity", "0.3")
+        if kind == "node":
+            link = element("a", href=f"{address}/{names[0]}")
+            link.append(part)
+            part = link
+        parts.append(part)
+    linked = Picture(picture.name, picture.width, picture.height, parts)
+    return cell_html(Section("", figures=[Figure("", linked)]))
+
+
+def _draw_pixels(view: View) -> Picture:
+    image = image_of(view)
+    height, width = image.shape[:2]
+    size = float(WIDTH), WIDTH * height / width
+    return Picture(view.name, *size, [raster(image, 0.0, 0.0, *size)])
+
+
+IMAGES: dict[str, Callable[[View, Step], Picture]] = {
+    "segments and shapes": lambda view, step: draw_image(view, step.labels, step.graph, WIDTH),
+    "segments": lambda view, step: draw_image(view, step.labels, step.graph, WIDTH, shapes=False),
+    "colour": lambda view, _: _draw_pixels(view),
+    "depth": lambda view, _: _draw_pixels(View(view.depth, view.K, name=view.name)),
+}
+"""Ways to draw the image of a step's view."""
+
+
+def draw_view(step: Step, kind: str) -> str:
+    """Draw the image of a step's view as one of `IMAGES`."""
+    if step.view is None:
+        return cell_html(Section("", "This view is a point cloud, without an image."))
+    return cell_html(Section("", figures=[Figure("", IMAGES[kind](step.view, step))]))
+
+
+def describe_signs() -> str:
+    """Explain the symbols in the scene."""
+    signs = {
+        "Arrow": "supporter → supported, at their contact; thicker = more probable, dashed = doubtful. "
+        "Supports by a support surface are drawn only if doubtful",
+        "Number on an arrow": "probability of the support, if below 1",
+        "Number in the graph": "views that found the object, of those that could have shown it",
+        "Grid": "10 cm, under the support surface; red and green: x and y of the world, from x = y = 0",
+        "Gripper": "how it grasps the object chosen, or the first of the order",
+        "Coloured dots on the sphere": "candidate views that the robot can reach, coloured by saliency",
+        "Fine grey dots": "views out of reach",
+        "Balls with rays": "points of interest, and the views that show them best",
+        "Grey robot": "where it stands, and as a line on the floor, the way it came",
+        "Grey cameras": "earlier views with their images; the newest is black and larger",
+        "Filled camera": "next view: blue = chosen by the planner, pink = chosen by hand",
+    }
+    bar = scale(np.tile(np.linspace(-1.0, 1.0, 340), (10, 1)), SALIENCY_STOPS)
+    picture = Picture("saliency", 340.0, 10.0, [raster(bar, 0.0, 0.0, 340.0, 10.0)])
+    caption = "Saliency: from low (already seen) to high (look here); the maximum of each view is red."
+    keys = {"Esc": "deselect the object", "Page up, page down": "earlier and later view"}
+    figures = [Figure("", picture, caption)]
+    return cell_html(Section("Key", facts=[*signs.items(), *keys.items()], figures=figures))
