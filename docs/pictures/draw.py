@@ -235,12 +235,23 @@ def viewer(browser: Any) -> Iterator[tuple[str, Image.Image]]:
         page.describe("o6")
         tab.wait_for_text("Without o6")
         yield "object", shot(tab)
-        tab.press("clear")
+        page.describe("")
+        tab.page.get_by_text("order", exact=True).click()
+        page._gripper.value = "franka"
+        tab.press("plan order")
+        tab.wait_for_text("after view 3")
+        yield "order", shot(tab)
+        tab.press("clear the table")
         page.wait()
         tab.wait_for_text("finished")
         yield "cleared", shot(tab)
     with viewing(browser, "sample-recording", segmentation="auto") as (_, tab):
+        tab.page.get_by_text("image", exact=True).click()
         yield "recording", shot(tab)
+        tab.page.set_viewport_size({"width": 1600, "height": 1000})
+        yield "large", shot(tab)
+        tab.page.set_viewport_size({"width": 390, "height": 844})
+        yield "phone", shot(tab)
 
 
 def main(what: Annotated[Literal["concepts", "film", "viewer"], tyro.conf.Positional]) -> None:
