@@ -198,6 +198,15 @@ class TestOrder:
         assert "lifting o1 disturbs o2, lifting o2 disturbs o1" in order.refusal
         assert [s.safe for s in order.steps if s.object_id == "o3"] == [True]
 
+    def test_a_goal_may_be_a_name_that_one_object_has(self):
+        graph, names = tower(), {"o2": "red mug", "o3": "box", "o4": "box"}
+        graph = replace(graph, objects=tuple(replace(o, name=names.get(o.id)) for o in graph.objects))
+        assert [s.object_id for s in plan_order(graph, CONFIG, goal="red mug").steps] == ["o3", "o2"]
+        with refusal("box", "is the name of several objects; give the id: o3, o4"):
+            plan_order(graph, CONFIG, goal="box")
+        with refusal("teapot", "not an object"):
+            plan_order(graph, CONFIG, goal="teapot")
+
     def test_nothing_to_take_and_unknown_goals_are_refused(self):
         with pytest.raises(InputError, match="no objects"):
             plan_order(SupportGraph((table_object(TOP),)), CONFIG)

@@ -128,8 +128,8 @@ class Explorer:
         segmentation: `labels`, `auto`, or None to use labels if available.
         seed: Seed of every random choice.
         masks: Source of masks, or None to use those of the views.
-        goal: Id of an object to remove, even if no view shows it yet. Planner `support` then looks at what
-            its removal depends on, and the loop stops when that is known.
+        goal: Id or name of an object to remove, even if no view shows it yet. Planner `support` then looks
+            at what its removal depends on, and the loop stops when that is known.
         until: Probability [1], above 0.5, at which a support counts as known; with a goal, whether an object
             moves. The loop stops when all are known. None = 0.95 with a goal, otherwise never.
         budget: Time that each `look` after the first takes [s], as for `Scene.update`; None = until the view
@@ -138,7 +138,7 @@ class Explorer:
     Attributes:
         scene: The scene model.
         robot: The robot.
-        goal: Id of the object to remove, or None.
+        goal: Id or name of the object to remove, or None.
         step: The newest step, or None before the first view.
 
     Raises:
@@ -314,7 +314,7 @@ class Explorer:
         step = self._newest()
         if step.decision is None or step.candidates is None:
             return step.stop
-        state, goal, until = self._state(step.candidates), self.goal, self._until
+        state, goal, until = self._state(step.candidates), self._goal_id(), self._until
         # Without a goal, nothing checks whether objects are hidden in the first view.
         asked = until if goal is not None or step.index > 0 else None
         if asked is not None and settled(state.graph, goal, asked, self.predict().removal):
@@ -329,10 +329,10 @@ class Explorer:
         Raises:
             PlanningError: No view was taken yet.
         """
-        step, scene = self._newest(), self.scene
-        if step.removal is None or step.removal.object_id != self.goal:
+        step, scene, goal = self._newest(), self.scene, self._goal_id()
+        if step.removal is None or step.removal.object_id != goal:
             assert scene.voxels is not None
-            removal = predict_goal(step.graph, self.goal, scene.voxels, scene.config.support)
+            removal = predict_goal(step.graph, goal, scene.voxels, scene.config.support)
             self.step = replace(step, removal=removal)
         return self._newest()
 
@@ -404,7 +404,11 @@ class Explorer:
         step = self._newest()
         poses = [v.pose for v in self.scene.open if isinstance(v, View) and v.T_world_camera is not None]
         visited = np.concatenate([step.visited, *(step.sphere.direction_of(T)[None] for T in poses)])
-        return planning_state(self.scene, step.sphere, visited, candidates, self.goal)
+        return planning_state(self.scene, step.sphere, visited, candidates, self._goal_id())
+
+    def _goal_id(self) -> str | None:
+        """The goal's id, if it is known by its name and was found."""
+        return None if self.goal is None else self._newest().graph.find_id(self.goal)
 
     def _moving(self) -> Robot:
         if self.robot is None:
@@ -476,7 +480,7 @@ def explore(
                 yield late
                 step = replace(late, stop=step.stop)
             step = replace(step, reasons=explorer.scene.reasons())
-            lost = goal is not None and all(o.id != goal for o in step.graph.objects)
+            lost = goal is not None and step.graph.find_id(goal) not in step.graph
             yield replace(step, stop=f"{step.stop}; {goal} was not found") if lost else step
             return
 

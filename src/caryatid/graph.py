@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from caryatid.errors import GoalError
 from caryatid.geometry.shapes import Shape, Uncertainty
 from caryatid.geometry.transforms import Array
 from caryatid.runtime import Pictured
@@ -155,6 +156,19 @@ class SupportGraph(Pictured):
 
     def __iter__(self) -> Iterator[str]:
         return (o.id for o in self.objects)
+
+    def find_id(self, word: str) -> str:
+        """Return the id of the object with an id or a name; the word itself if there is none.
+
+        Raises:
+            GoalError: Several objects have the name.
+        """
+        ids = [o.id for o in self.objects if o.name == word]
+        if word in self or not ids:
+            return word
+        if len(ids) > 1:
+            raise GoalError(word, "is the name of several objects", f"give the id: {', '.join(ids)}")
+        return ids[0]
 
     @property
     def support_surface(self) -> SceneObject | None:

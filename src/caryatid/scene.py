@@ -236,7 +236,7 @@ class Scene(Pictured):
         A gripper moves only through space that was seen empty.
 
         Args:
-            goal: Id of the object to reach; only objects in its way are removed.
+            goal: Id or name of the object to reach; only objects in its way are removed.
             gripper: Kind or name of a gripper, such as `franka`, or its settings; None = that of the
                 configuration, without which every object can be grasped.
             hands: 2 if another hand can hold one object, else 1.
@@ -247,7 +247,7 @@ class Scene(Pictured):
             The order: its `steps`, whether it is `safe`, and the `risk` of all lifts together.
 
         Raises:
-            GoalError: The goal is not an object of the graph.
+            GoalError: The goal is not an object of the graph, or the name of several.
             InputError: The gripper is unknown, or the scene has no objects.
         """
         names = {*GRIPPERS, *get_args(GripperKind)}

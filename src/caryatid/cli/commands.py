@@ -66,8 +66,8 @@ class Explore(RunCommand, options.ExploringCommand, work="run:explore_scene"):
     """Scene or recording."""
     no_early_stop: options.Flag = False
     """Continue to the maximum number of views, even if no view is worth its path."""
-    goal: Annotated[str | None, options.shown("ID")] = None
-    """Object to remove: explore only what matters for it, and stop when it is clear what else would move."""
+    goal: Annotated[str | None, options.shown("OBJECT")] = None
+    """Id or name of an object to remove: explore only what matters for that, until it is clear what moves."""
     until: Annotated[float | None, options.shown("P", "0.95 with --goal, else never")] = None
     """Stop when every support (with --goal, every effect of the removal) is known with this probability."""
     budget: Annotated[options.Seconds | None, options.shown("SECONDS", "as long as a view takes")] = None

@@ -318,8 +318,8 @@ class ExploringCommand(PlanningCommand):
 class LiftingCommand:
     """A command that decides which objects to lift."""
 
-    goal: Annotated[str | None, shown("ID")] = None
-    """Object to reach; remove no more than necessary."""
+    goal: Annotated[str | None, shown("OBJECT")] = None
+    """Id or name of the object to reach; remove no more than necessary."""
     hands: Literal[1, 2] = 1
     """Number of hands; with 2, one may hold an object while the other lifts one."""
     gripper: Annotated[GripperName | None, default_of("gripper.kind")] = None

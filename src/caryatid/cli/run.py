@@ -142,8 +142,7 @@ def clear_table(command: Clear) -> int:
         if not lifts.done:
             _check_found(command.goal, last)
         left, harmed = lifts.hands.left, sorted({body for lift in lifts.done for body in lift["disturbed"]})
-        gone = {lift["object"] for lift in lifts.done if lift["body"] is not None}
-        success = not harmed and (command.goal in gone if command.goal else not left)
+        success = not harmed and (last.stop == f"{command.goal} is removed" if command.goal else not left)
         taken = [{name: value for name, value in lift.items() if name != "state"} for lift in lifts.done]
         document = {"run": str(command.out), "success": success, "stop": last.stop, "views": last.index + 1}
         document |= {"steps": taken, "left": left, "warnings": output.warnings}
@@ -229,8 +228,8 @@ def _check_goal(command: Explore | Clear, source: Source, config: Config) -> Non
 
 def _check_found(goal: str | None, last: Step) -> None:
     """Reject a goal that the last graph lacks."""
-    found = [o.id for o in last.graph.objects if o.role == "object"]
-    if goal is not None and goal not in found:
+    found = [o.title for o in last.graph.objects if o.role == "object"]
+    if goal is not None and last.graph.find_id(goal) not in last.graph:
         reason = f"was not found in {count_of(last.index + 1, 'view')}"
         raise GoalError(f"--goal {goal}", reason, f"objects found: {', '.join(found) or 'none'}")
 

@@ -47,7 +47,7 @@ def clear(
     Args:
         explorer: Explorer with a camera and a robot, without a goal.
         take: Removes an object; returns whether it was in place.
-        goal: Id of the object to reach; None = remove all.
+        goal: Id or name of the object to reach; None = remove all.
         hands: 2 if another hand can hold one object, else 1.
         threads: Number of parallel rehearsals.
         reachable: Which gripper poses (N, 4, 4), in the world frame, the arm reaches; None = all.
@@ -79,13 +79,14 @@ def clear(
         explorer.look()
         explorer.finish()
         views += 1
-        lift, reason = _lift(explorer, goal, hands, threads, views, reachable)
+        found = None if goal is None else explorer.scene.graph.find_id(goal)
+        lift, reason = _lift(explorer, found, hands, threads, views, reachable)
         if lift is not None:
             views, missed = 0, 0 if take(lift) else missed + 1
             explorer.scene.removed(lift.object_id)
             explorer.goal = goal
             explorer.plan()
-            if lift.object_id == goal and not missed:
+            if lift.object_id == found and not missed:
                 reason = f"{goal} is removed"
             elif missed == MISSES:
                 reason = f"{MISSES} lifts in a row found no object in place"

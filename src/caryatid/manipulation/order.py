@@ -109,7 +109,7 @@ def plan_order(
     Args:
         graph: The extracted graph.
         config: Settings of lifts, rehearsals and the gripper.
-        goal: Id of the object to reach; only objects in its way are removed.
+        goal: Id or name of the object to reach; only objects in its way are removed.
         hands: 2 if another hand can hold one object, else 1.
         steps: Maximum number of steps; None = all.
         seed: Seed of the rehearsals.
@@ -118,7 +118,7 @@ def plan_order(
         reachable: Which gripper poses (N, 4, 4), in the world frame, the arm reaches; None = all.
 
     Raises:
-        GoalError: The goal is not an object of the graph.
+        GoalError: The goal is not an object of the graph, or the name of several.
         InputError: The graph has no support surface, no objects, or more than `rehearsal.max_objects`; or
             there are no threads, or hands.
     """
@@ -127,6 +127,7 @@ def plan_order(
         raise InputError("hands", f"{hands} is neither 1 nor 2", "give the number of hands")
     if threads < 1:
         raise InputError("threads", f"{threads} is less than 1", "give the number of parallel rehearsals")
+    goal = None if goal is None else graph.find_id(goal)
     rehearsal = _Rehearsal(graph, config or Config(), seed, threads, voxels, reachable)
     if goal is not None and goal not in rehearsal.ids:
         raise GoalError(goal, "is not an object of the graph", f"known objects: {', '.join(rehearsal.ids)}")
