@@ -144,6 +144,17 @@ def test_a_second_goal_is_rejected_and_hands_are_checked(client):
     assert "mm and " in result.message
 
 
+def test_an_order_for_a_named_gripper_has_its_grasps(client):
+    assert client.explore(max_views=3, restart=True).result()[0] == SUCCEEDED
+    (lift,) = client.call("order", steps=1, gripper="franka").lifts
+    assert 0.0 < lift.grasp[0].width < 0.08
+    (lift,) = client.call("order", steps=1).lifts
+    assert not lift.grasp
+    assert client.call("order", gripper="claw").message.startswith(
+        "gripper: 'claw' is unknown; choose one of"
+    )
+
+
 def test_transforms_that_stop_are_told_while_the_camera_is_awaited(client):
     goal = client.explore(restart=True)
     wait_for(lambda: goal.feedback, 30.0)

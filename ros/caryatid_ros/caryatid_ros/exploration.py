@@ -16,10 +16,8 @@ from caryatid.exploration import Explorer
 from caryatid.graph import SceneObject
 from caryatid.io.bags import is_rectified
 from caryatid.io.mask_sources import mask_source, without_ignored
-from caryatid.manipulation.order import plan_order
 from caryatid.planning.planners import make_planner
 from caryatid.robots import find_robot
-from caryatid.runtime.parallel import cores
 from caryatid.scene import Scene
 from caryatid.sessions.carried_camera import CarriedCamera
 from caryatid.sessions.session import Session, SessionConflictError
@@ -206,10 +204,9 @@ class Exploration:
 
     def order(self, request: Any, response: Any) -> None:
         """Plan a removal order, and fill in an Order response; another thread may change the scene."""
-        scene = self._known().copy()
-        found = plan_order(
-            scene.graph, scene.config, goal=request.goal or None, hands=request.hands or 1,
-            steps=request.steps or None, seed=scene.seed, threads=cores(), voxels=scene.voxels,
+        found = self._known().copy().order(
+            goal=request.goal or None, gripper=request.gripper or None, hands=request.hands or 1,
+            steps=request.steps or None,
         )  # fmt: skip
         response.lifts = messages.lift_messages(self._make, found)
         response.safe, response.message = found.safe, found.refusal

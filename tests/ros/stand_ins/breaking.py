@@ -6,7 +6,6 @@ from typing import Any
 
 from caryatid.robots import HUMANOID, find_robot
 from caryatid.scene import Scene
-from caryatid_ros import exploration
 
 make = find_robot(HUMANOID)
 
@@ -20,5 +19,5 @@ def _broken(work: Any) -> Any:
     return call
 
 
-exploration.plan_order = _broken(exploration.plan_order)
+Scene.order = _broken(Scene.order)  # type: ignore[method-assign]
 Scene.removed = _broken(Scene.removed)  # type: ignore[method-assign]
