@@ -2,8 +2,9 @@
 
     python tests/ros/table.py --ros-args -p scene:=tower
 
-Its parameters may be changed while it runs. The camera moves to the newest `decision` (or stays). Its service
-`go_home` moves the camera to its first pose, and says whether another node is listening.
+Its parameters may be changed while it runs. The camera moves to the newest `decision` (or stays), or with
+`carried` is where tf says. Its service `go_home` moves the camera to its first pose, and says whether another
+node is listening.
 """
 
 from __future__ import annotations
@@ -21,15 +22,18 @@ from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation, Slerp
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
+from tf2_ros import Buffer, TransformException, TransformListener
 
 from caryatid.benchmark.episodes import open_scene
 from caryatid.config import Config, SensorConfig
 from caryatid.simulation.setup import make_simulation
+from caryatid_ros.messages import matrix_of
 
 DEFAULTS = {
     "scene": "tower",
@@ -37,6 +41,7 @@ DEFAULTS = {
     "focal": 262.5,
     "rate": 15.0,  # images per second
     "follow": True,  # whether the camera moves to decisions
+    "carried": False,  # whether something else carries the camera: then tf says where it is
     "motion_time": 0.3,  # of a motion [s]
     "encoding": "32FC1",  # of depth
     "topics": ["depth", "colour", "info", "tf"],  # what is published; also labels
@@ -65,6 +70,8 @@ class Table(Node):
         self.camera, self.pose = simulation.camera, simulation.robot.T_world_camera
         self._home = self.pose
         self._way: tuple[float, np.ndarray, np.ndarray] | None = None
+        self._buffer = Buffer()
+        self._listener = TransformListener(self._buffer, self)
         self._drawn: tuple[bytes, tuple] | None = None
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._depth_topic = self.create_publisher(Image, "/camera/depth", qos_profile_sensor_data)
@@ -102,7 +109,13 @@ class Table(Node):
         return response
 
     def _move(self) -> None:
-        if self._way is not None:
+        carried = self._value("carried")
+        if carried:
+            with suppress(TransformException):
+                names = self._value("world"), self._value("frame")
+                found = self._buffer.lookup_transform(*names, Time()).transform
+                self.pose = matrix_of(found.rotation, found.translation, "camera")
+        elif self._way is not None:
             since, start, end = self._way
             share = min(1.0, (time.monotonic() - since) / max(self._value("motion_time"), 1e-3))
             turn = Slerp([0.0, 1.0], Rotation.from_matrix([start[:3, :3], end[:3, :3]]))
@@ -114,7 +127,7 @@ class Table(Node):
             stamp = Clock()
             stamp.clock.sec, stamp.clock.nanosec = divmod(time.time_ns(), 1_000_000_000)
             self._clock_topic.publish(stamp)
-        if "tf" in topics:
+        if "tf" in topics and not carried:
             message = TransformStamped()
             message.header.stamp, message.header.frame_id = now, self._value("world")
             message.child_frame_id = self._value("frame")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from conftest import wait_for
-from moveit_msgs.msg import AllowedCollisionEntry, AllowedCollisionMatrix, CollisionObject, PlanningScene
-from moveit_msgs.srv import GetPlanningScene
+from moveit_msgs.msg import PlanningScene
+from planner import Planner
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 from vision_msgs.msg import (
@@ -24,65 +24,12 @@ from caryatid_ros.messages import make_message, pose_message
 GRIPPER = {"planning_scene": "/planning_scene", "gripper_links": "hand finger"}
 
 
-class Planner:
-    """A planner that keeps its planning scene as MoveIt does.
-
-    Attributes:
-        world: Objects by id.
-        held: Objects that are attached to a link, by id.
-        matrix: Allowed collisions.
-        scenes: Number of diffs it applied.
-    """
-
-    def __init__(self, node) -> None:
-        rows = [AllowedCollisionEntry(enabled=row) for row in ([False, True], [True, False])]
-        self.world, self.held, self.scenes = {}, {}, 0
-        self.matrix = AllowedCollisionMatrix(entry_names=["hand", "finger"], entry_values=rows)
-        self._node = node
-        self._service = node.create_service(GetPlanningScene, "/get_planning_scene", self._answer)
-        self._topic = node.create_subscription(PlanningScene, "/planning_scene", self._apply, 10)
-
-    def destroy(self) -> None:
-        """Stop."""
-        self._node.destroy_service(self._service)
-        self._node.destroy_subscription(self._topic)
-
-    @property
-    def touching(self) -> set[frozenset[str]]:
-        """The pairs that may touch."""
-        names, rows = self.matrix.entry_names, self.matrix.entry_values
-        pairs = zip(names, rows, strict=True)
-        return {frozenset((a, b)) for a, row in pairs for b, on in zip(names, row.enabled, strict=True) if on}
-
-    def _answer(self, request, response):
-        response.scene.allowed_collision_matrix = self.matrix
-        return response
-
-    def _apply(self, scene) -> None:
-        assert scene.is_diff
-        assert scene.robot_state.is_diff
-        for body in scene.robot_state.attached_collision_objects:
-            if body.object.operation == CollisionObject.REMOVE:
-                self.world[body.object.id] = self.held.pop(body.object.id).object
-            else:
-                self.world.pop(body.object.id, None)
-                self.held[body.object.id] = body
-        if scene.allowed_collision_matrix.entry_names:
-            self.matrix = scene.allowed_collision_matrix
-        for item in scene.world.collision_objects:
-            if item.operation == CollisionObject.REMOVE:
-                del self.world[item.id]
-            else:
-                self.world[item.id] = item
-        self.scenes += 1
-
-
 @pytest.fixture
 def planner(client):
     """A planner."""
     found = Planner(client)
     yield found
-    found.destroy()
+    client.run(found.destroy)
 
 
 def test_moveit_knows_what_is_there_what_may_touch_and_what_is_held(start_ready, client, planner):
