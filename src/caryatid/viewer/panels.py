@@ -19,7 +19,7 @@ from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.notebook import cell_html
 from caryatid.viz.pictures import Picture, element, raster
 from caryatid.viz.report import Figure, Section
-from caryatid.viz.tables import census, noticed, object_table, order_line, support_table
+from caryatid.viz.tables import census, happenings, object_table, order_line, support_table
 
 WIDTH = 380
 """Of pictures in a panel [px]."""
@@ -28,15 +28,7 @@ WIDTH = 380
 def describe_view(step: Step, f1: float | None, count: int, before: Step | None = None) -> str:
     """Describe the scene after a view, what happened since the step before, and what comes next."""
     facts = [] if f1 is None else [("F1", f"{f1:.3f}")]
-    facts += [(change.kind, f"{change.object_id}: {change.why}") for change in noticed(before, step)]
-    if step.removal is not None:
-        facts.append((f"without {step.removal.object_id}", str(step.removal)))
-    if step.lift is not None:
-        facts.append(("removed", f"{step.lift.object_id}: {step.lift.why}"))
-    if step.stop is not None:
-        facts.append(("finished", step.stop))
-    elif step.decision is not None:
-        facts.append(("next", step.decision.why))
+    facts += happenings(before, step)
     return cell_html(Section(f"View {step.index + 1} of {count}", census(step.graph), facts=facts))
 
 

@@ -95,7 +95,7 @@ def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
         for side, turn in (("front", 0.0), ("back", np.pi)):
             _add(scene, f"name of {item.id}, {side}", *_plate(shown(item), azimuth + turn))
     for number, support in enumerate(graph.supports):
-        arrow = _arrow(*support_ends(support, graph), 0.0035 * max(support.belief, 0.3))
+        arrow = support_arrow(support, graph)
         if arrow is not None:
             arrow.visual = _material(rgb(THEME["doubt" if support.doubtful else "ink"]), 255)
             _add(scene, f"support {number}", arrow)
@@ -133,8 +133,13 @@ def _material(colour: Colour, opacity: int) -> TextureVisuals:
     return TextureVisuals(material=PBRMaterial(baseColorFactor=[*lit, opacity], emissiveFactor=unlit, **look))
 
 
-def _arrow(start: Array, end: Array, radius: float) -> trimesh.Trimesh | None:
-    """An arrow as a mesh, or None where it has no length."""
+def support_arrow(support: Support, graph: SupportGraph) -> trimesh.Trimesh | None:
+    """Make the mesh of the arrow of a support in the world: the thicker the more probable it is."""
+    return make_arrow(*support_ends(support, graph), 0.0035 * max(support.belief, 0.3))
+
+
+def make_arrow(start: Array, end: Array, radius: float) -> trimesh.Trimesh | None:
+    """Make the mesh of an arrow between two points (3,) [m], or None where it has no length."""
     import trimesh
 
     along = end - start

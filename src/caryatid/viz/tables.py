@@ -251,6 +251,20 @@ def noticed(before: Step | None, step: Step) -> list[Change]:
     return [c for c in step.changes if (c.kind, c.object_id) != ("removed", lifted)]
 
 
+def happenings(before: Step | None, step: Step) -> list[tuple[str, str]]:
+    """List what happened to objects before and after a view, and last what comes next or why nothing does."""
+    told: list[tuple[str, str]] = [(c.kind, f"{c.object_id}: {c.why}") for c in noticed(before, step)]
+    if step.removal is not None:
+        told.append((f"without {step.removal.object_id}", str(step.removal)))
+    if step.lift is not None:
+        told.append(("removed", f"{step.lift.object_id}: {step.lift.why}"))
+    if step.stop is not None:
+        told.append(("finished", step.stop))
+    elif step.decision is not None:
+        told.append(("next", step.decision.why))
+    return told
+
+
 def changes(before: Step | None, step: Step) -> list[str]:
     """List the changes of a view: one line each for objects found, changed, and gone.
 
