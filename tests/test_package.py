@@ -80,7 +80,7 @@ def test_metadata_for_package_indices(built):
     assert told["License-Expression"] == "BSD-3-Clause"
     assert told["Description-Content-Type"] == "text/markdown"
     assert told.get_payload() == (ROOT / "README.md").read_text()
-    users = {"view", "serve", "ros", "usd", "dsg", "arm", "phone", "benchmark", "cluster", "all"}
+    users = {*MODULES, "arm", "all"}
     extras = users | {"bench", "docs", "dev"}
     assert set(told.get_all("Provides-Extra")) == extras
     (scripts,) = (name for name in built[0].namelist() if name.endswith("entry_points.txt"))
@@ -131,6 +131,8 @@ MODULES = {
     "ros": ["rosbags"],
     "usd": ["pxr"],
     "dsg": ["spark_dsg"],
+    "rerun": ["rerun"],
+    "foxglove": ["foxglove"],
     "benchmark": ["pandas", "pyarrow"],
     "cluster": ["distributed", "dask"],
 }
@@ -179,6 +181,8 @@ WORDS = {
     "ros": "import {folder}/pour.bag --depth /d --info /i --out {folder}/pour",
     "usd": "export {run} --out {folder}/scene.usda",
     "dsg": "export {run} --out {folder}/scene.sparkdsg",
+    "rerun": "export {run} --out {folder}/run.rrd",
+    "foxglove": "export {run} --out {folder}/run.mcap",
     "benchmark": "benchmark --out {folder}/bench",
     "cluster": "benchmark --suite smoke --scheduler tcp://127.0.0.1:1 --out {folder}/bench",
 }
@@ -191,7 +195,7 @@ def test_a_missing_extra_is_named(tmp_path, scene_file, views, extra):
     if extra == "ros":
         write_bag(tmp_path / "pour.bag", views)
     run = tmp_path / "run"
-    if extra in ("view", "usd", "dsg"):
+    if extra in ("view", "usd", "dsg", "rerun", "foxglove"):
         words = ["--views", 1, "--out", run, *SMALL, "--quiet", "--no-report"]
         assert run_command("explore", scene_file, *words) == 0
     before = sorted(tmp_path.rglob("*"))

@@ -60,6 +60,7 @@ class Explore(RunCommand, options.ExploringCommand, work="run:explore_scene"):
       caryatid explore scene.xml --views 5 --out run
       caryatid explore tower --robot arm:arm.npz --out run
       caryatid explore recording/ --segmentation auto --out run
+      caryatid explore clutter --stream rerun
     """
 
     source: options.SourceName
@@ -72,6 +73,8 @@ class Explore(RunCommand, options.ExploringCommand, work="run:explore_scene"):
     """Stop when every support (with --goal, every effect of the removal) is known with this probability."""
     budget: Annotated[options.Seconds | None, options.shown("SECONDS", "as long as a view takes")] = None
     """Time for each view after the first; the robot then goes on while the view is being added."""
+    stream: Annotated[str | None, options.shown("{FILE.rrd,FILE.mcap,rerun}")] = None
+    """Also record each view for Rerun or Foxglove, or show it in Rerun's viewer."""
     view: options.Flag = False
     """Show the exploration in the browser; Ctrl-C closes the page."""
 
@@ -295,10 +298,13 @@ class Why(options.Command, work="results:tell_reasons"):
 class Export(options.Command, work="results:export_model"):
     """Export the scene model of a run to simulators, 3D viewers, motion and task planners, and graph tools.
 
+    With the suffix .rrd or .mcap, export every view of the run, for Rerun or Foxglove.
+
     Usage examples:
       caryatid export run --format mjcf --out scene.xml
       caryatid export run --format moveit --out scene.json --set export.frame=base_link
       caryatid export run --out scene.glb
+      caryatid export run --out views.rrd
     """
 
     settings: options.Settings = options.Settings()

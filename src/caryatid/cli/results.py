@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from contextlib import closing
+from itertools import repeat
 from pathlib import Path
 
 from rich.progress import MofNCompleteColumn, Progress
@@ -22,6 +23,7 @@ from caryatid.config import Config
 from caryatid.errors import InputError, needs_extra
 from caryatid.evaluation.truths import evaluate_run
 from caryatid.exports import export_graph, format_of
+from caryatid.exports.streams import STREAMS, Stream
 from caryatid.io.datasets import OpenOptions, open_dataset
 from caryatid.io.importing import import_recording, levelled, reasons
 from caryatid.io.staging import write_file
@@ -162,7 +164,16 @@ def redraw_report(command: Report) -> None:
 
 
 def export_model(command: Export) -> None:
-    config, out, format_ = command.settings.read(), command.out, format_of(command.out, command.format)
+    config, out = command.settings.read(), command.out
+    if command.format is None and out.suffix in STREAMS:
+        with open_run(command.run) as run, Stream(out) as stream:
+            scores = [score["f1"] for score in run.record.get("scores", ())]
+            for step, f1 in zip(read_steps(run), scores or repeat(None), strict=False):
+                stream.add(step, f1)
+        command.output.result({"file": str(out), "format": out.suffix[1:]}, "")
+        command.output.say(f"{out}: {count_of(len(run.views), 'view')}")
+        return
+    format_ = format_of(out, command.format)
     graph, _ = read_model(command.run)
     export_graph(graph, out, config.export)
     command.output.result({"file": str(out), "format": format_}, "")

@@ -25,6 +25,7 @@ from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import TrueScene, score
 from caryatid.evaluation.truths import evaluate_run
 from caryatid.exploration import Explorer, Step, explore
+from caryatid.exports.streams import Stream
 from caryatid.graph import TakeStep, object_id
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.json_files import plain
@@ -57,7 +58,8 @@ def explore_scene(command: Explore) -> None:
                 camera, source.robot, planner=planner, config=config, masks=masks, goal=command.goal,
                 until=command.until, budget=command.budget, early_stop=not command.no_early_stop, **looking,
             )  # fmt: skip
-            last = _record(command, writer, name, steps, truth, page)
+            with Stream(command.stream) if command.stream else nullcontext() as stream:
+                last = _record(command, writer, name, steps, truth, page, stream)
         _finish(command, writer, name, last, command.goal)
 
 
@@ -309,6 +311,7 @@ def _record(
     steps: Iterator[Step],
     truth: TrueScene | None = None,
     page: Page | None = None,
+    stream: Stream | None = None,
 ) -> Step:
     """Score, save, print and show every step; return the last."""
     output, last, conditions = command.output, None, _conditions(command)
@@ -322,8 +325,9 @@ def _record(
             output.say(f"  done: {step.stop}")
         else:
             output.step(step, last, scored)
-        if page is not None:
-            page.add(step, None if scored is None else scored.f1)
+        for shown in (page, stream):
+            if shown is not None:
+                shown.add(step, None if scored is None else scored.f1)
         last = step
     assert last is not None, "the first view is always taken"
     return last
