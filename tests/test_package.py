@@ -133,6 +133,7 @@ MODULES = {
     "dsg": ["spark_dsg"],
     "rerun": ["rerun"],
     "foxglove": ["foxglove"],
+    "learn": ["gymnasium"],
     "benchmark": ["pandas", "pyarrow"],
     "cluster": ["distributed", "dask"],
 }
