@@ -100,6 +100,12 @@ html_theme_options = {
     "footer_end": ["theme-version"],
     "navigation_with_keys": False,
 }
+if site := os.environ.get("DOCS_URL"):  # of a site with a folder for each version: tools/publish_docs.sh
+    html_theme_options |= {
+        "switcher": {"json_url": f"{site}/switcher.json", "version_match": os.environ["DOCS_VERSION"]},
+        "check_switcher": False,  # it exists only once the pages are published
+        "navbar_start": ["navbar-logo", "version-switcher"],
+    }
 html_sidebars = {"index": [], "concepts": []}
 html_copy_source = False
 html_show_sourcelink = False

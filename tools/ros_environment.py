@@ -50,7 +50,7 @@ PACKAGE = """<package format="3">
   <name>{name}</name>
   <version>0.0.0</version>
   <description>Messages for tests.</description>
-  <maintainer email="maintainers@caryatid.example">the caryatid authors</maintainer>
+  <maintainer email="nobody@caryatid.invalid">the caryatid authors</maintainer>
   <license>BSD-3-Clause</license>
   <member_of_group>rosidl_interface_packages</member_of_group>
   <export><build_type>ament_cmake</build_type></export>

@@ -16,7 +16,7 @@ setup(
     install_requires=["setuptools"],
     zip_safe=True,
     maintainer="the caryatid authors",
-    maintainer_email="maintainers@caryatid.example",
+    maintainer_email="nobody@caryatid.invalid",
     description="A ROS 2 node that explores a cluttered table with caryatid.",
     license="BSD-3-Clause",
     entry_points={"console_scripts": [f"explore = {NAME}.node:main"]},
