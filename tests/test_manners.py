@@ -275,6 +275,13 @@ cli.run_from_shell()
     assert (ended.returncode, ended.stderr) == (130, "")
 
 
+def test_a_system_without_posix_signals_is_refused_in_one_sentence():
+    program = "import signal; del signal.SIGALRM; import caryatid.cli as cli; cli.run_from_shell()"
+    ended = subprocess.run([sys.executable, "-c", program], stderr=subprocess.PIPE, text=True, timeout=60)
+    assert ended.returncode == 1
+    assert ended.stderr == "error: caryatid: this system has no POSIX signals; on Windows, run it in WSL\n"
+
+
 # Colours, and what moves
 
 

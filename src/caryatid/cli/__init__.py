@@ -79,6 +79,8 @@ def _interrupt_again(lost: sys.UnraisableHookArgs) -> None:
 
 def _catch_signals() -> None:
     """Make SIGTERM, SIGHUP and repeated interrupts raise KeyboardInterrupt."""
+    if not hasattr(signal, "SIGALRM"):
+        sys.exit("error: caryatid: this system has no POSIX signals; on Windows, run it in WSL")
     signal.signal(signal.SIGALRM, signal.default_int_handler)
     sys.unraisablehook = _interrupt_again
     for number in (signal.SIGTERM, signal.SIGHUP):
