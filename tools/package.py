@@ -20,13 +20,13 @@ VERSIONS = tuple(re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").rea
 
 
 def find_python(wanted: str) -> Path | None:
-    """Find an interpreter of a version such as 3.12: this one, or one on the PATH or in pyenv."""
+    """Find an interpreter of a version such as 3.12: this one, or one in pyenv or on the PATH."""
     if sys.version.startswith(f"{wanted}."):
         return Path(sys.executable)
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
-    found = pyenv.glob(f"{wanted}[.-]*/bin/python")
-    command = shutil.which(f"python{wanted}")
-    return Path(command) if command else max(found, key=numbers, default=None)
+    found = max(pyenv.glob(f"{wanted}[.-]*/bin/python"), key=numbers, default=None)
+    command = shutil.which(f"python{wanted}")  # of pyenv, a shim that may start none
+    return found or (Path(command) if command else None)
 
 
 def numbers(python: Path) -> list[int]:

@@ -50,7 +50,7 @@ def main() -> None:
     graph = json.loads(caryatid("extract", "sample-cloud", "--out", "cloud", "--json"))["graph"]
     check(len(graph["objects"]) > 3 and len(graph["supports"]) > 2, "too little was found in the cloud")
     lap("extract")
-    order = json.loads(caryatid("order", "run", "--set", "rehearsal.draws=2", "--json"))
+    order = json.loads(caryatid("order", "run", "--set", "rehearsal.draws=2", "--risk", "0.2", "--json"))
     check(len(order["steps"]) > 0, "no removal order was found")
     for ending in ("xml", "urdf", "glb", "json", "yml", "pddl", "graphml", "dot"):
         file = f"scene.{ending}"
