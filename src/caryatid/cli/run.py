@@ -10,6 +10,8 @@ from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
+from shlex import quote
+from shutil import which
 from threading import Event
 from typing import TYPE_CHECKING, Any
 
@@ -293,6 +295,8 @@ def _finish(
     _check_found(goal, last)
     output.say(f"{name}: {census(last.graph)} after {count_of(len(writer.steps), 'view')}")
     output.say(f"run: {command.out}" if command.no_report else f"report: {command.out / 'report.html'}")
+    program, out = "caryatid" if which("caryatid") else sys.argv[0], quote(str(command.out))
+    output.say(f"next: {program} order {out}, or {program} view {out}")
     document: dict[str, Any] = {"run": str(command.out), "stop": last.stop}
     if last.removal is not None:
         document["removal"] = last.removal.to_json()
