@@ -27,15 +27,15 @@ from caryatid.exports.streams import STREAMS, Stream
 from caryatid.io.datasets import OpenOptions, open_dataset
 from caryatid.io.importing import import_recording, levelled, reasons
 from caryatid.io.staging import write_file
-from caryatid.manipulation.order import plan_order
+from caryatid.manipulation import order as orders
 from caryatid.runtime import fingerprint
 from caryatid.runtime.parallel import cores
 from caryatid.segmentation.diagnosis import diagnose
 from caryatid.sources import kind_of, open_run, read_model, read_scene
-from caryatid.steps import read_config, read_steps
+from caryatid.steps import Run, read_config, read_steps
 from caryatid.viz.check_report import SHOWN, make_check_report
 from caryatid.viz.report import make_report, print_pdf, read_lift, render_html
-from caryatid.viz.tables import Table, census, count_of, describe, order_line, order_table
+from caryatid.viz.tables import Table, census, count_of, describe, order_line, order_table, tell_lifts
 
 
 def check_views(command: Check) -> int:
@@ -138,7 +138,7 @@ def find_order(command: Order) -> int:
     graph, voxels = read_model(command.run)
     reachable, seed = command.reachable(config), command.settings.seed
     with command.output.working("rehearsing"):
-        order = plan_order(
+        order = orders.plan_order(
             graph, config, goal=command.goal, hands=command.hands, seed=seed, threads=cores(),
             voxels=voxels, reachable=reachable,
         )  # fmt: skip
@@ -216,6 +216,7 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
             Path(record["source"]).name,
             read_steps(run),
             about=" · ".join(filter(None, about)),
+            answer=tell_lifts(record.get("lifts", ()), _plan_lift(run, config), run.graph),
             settings=settings,
             scores=record.get("scores", ()),
             strip=[read_lift(path) for path in sorted((folder / "lifts").glob("*.png"))],
@@ -228,6 +229,19 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
     for path, content in files.items():
         write_file(path, content)
     return list(files)
+
+
+def _plan_lift(run: Run, config: Config) -> orders.Order | str:
+    """Plan what to lift first after a run; or say why it is unknown, or nothing if no object is left."""
+    options, graph = run.record["options"], run.graph
+    goal = options["goal"] if options.get("goal") in graph else None
+    hands, seed = options.get("hands", 1), run.record["seed"]
+    if len(graph) == len(graph.support_surfaces):
+        return ""
+    try:
+        return orders.plan_order(graph, config, goal=goal, hands=hands, steps=1, seed=seed, threads=cores())
+    except InputError as error:
+        return str(error)
 
 
 def compare_methods(command: Benchmark) -> None:

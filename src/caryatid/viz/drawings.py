@@ -23,9 +23,11 @@ from caryatid.sensing.views import MAX_LABEL, Cloud, View
 from caryatid.viz import colours
 from caryatid.viz.colours import object_colour
 from caryatid.viz.pictures import (
+    DOUBT,
     INK,
     LINE,
     SOFT,
+    THEME,
     Picture,
     Tag,
     area,
@@ -276,21 +278,22 @@ def _from_above(centre_world: Array, scale: float, width: float, height: float) 
     return Projection(T_world_eye, K, np.zeros((1, 1), dtype=np.float32), parallel=True)
 
 
-def draw_stands(steps: Sequence[Step]) -> Picture:
+def draw_stands(steps: Sequence[Step], sides: Sequence[tuple[SceneObject, int]] = ()) -> Picture:
     """Draw from above where the robot stood for each view, where it looked, and the way it took.
 
     Args:
-        steps: Steps of which one at least knows its robot.
+        steps: Steps, the last with objects; robots are drawn where they are known.
+        sides: Objects, each with an azimuth [°] from where it should be looked at; shown by arrows.
     """
     held = [(step.index, step.robot) for step in steps if step.robot is not None]
-    decisions = [step.decision for step in steps[:-1] if step.decision is not None]
-    ways = [np.array([p.platform_world for p in decision.waypoints]) for decision in decisions]
-    objects, reach = steps[-1].graph.objects, 0.2 + held[0][1].footprint
+    ways = [np.array([p.platform_world for p in s.decision.waypoints]) for s in steps[:-1] if s.decision]
+    objects, reach = steps[-1].graph.objects, 0.2 + (held[0][1].footprint if held else 0.0)
     places = [np.stack([r.posture.platform_world, r.T_world_camera[:3, 3]])[:, :2] for _, r in held]
     ground = [item.shape.outline()[:, :2] for item in objects]
-    there = np.concatenate([*(way[:, :2] for way in ways if len(way)), *places])
+    aims = [item.centre_world + direction(np.deg2rad(side), 0.0) * [[0.6], [0.1]] for item, side in sides]
+    there = np.concatenate([*(way[:, :2] for way in ways if len(way)), *places, *(a[:, :2] for a in aims)])
     extent = np.concatenate([there - reach, there + reach, *ground])
-    low, high = extent.min(axis=0), extent.max(axis=0)
+    low, high = extent.min(axis=0) - (0.0, 0.3), extent.max(axis=0)  # Below are the scale and the axes.
     width, height = 480.0, 480.0 * float(np.clip((high - low)[1] / (high - low)[0], 0.6, 1.2))
     scale = float(((width, height) / (high - low)).min())
     above = _from_above(np.append((low + high) / 2.0, 0.0), scale, width, height)
@@ -311,10 +314,20 @@ def draw_stands(steps: Sequence[Step]) -> Picture:
         parts += [area(cone, VISITED, opacity=0.35), dot(platform, 3.0, VISITED)]
         x, y = (eye if robot.arm else platform).tolist()
         tags.append(Tag(x, y - 15.0, str(number + 1), VISITED))
+    alike: dict[int, list[tuple[str, int, Array]]] = {}
+    for (item, side), aim in zip(sides, aims, strict=True):
+        tail, tip = pixels(aim)
+        aside = 5.0 * transforms.unit(tail - tip)[::-1] * (1.0, -1.0)
+        parts.append(area(np.array([tip, tail + aside, tail - aside]), DOUBT, opacity=0.8))
+        alike.setdefault(round(side / 20.0) % 18, []).append((item.id, side, tail))  # One label within 20°.
+    for names, azimuths, tails in (zip(*arrows, strict=True) for arrows in alike.values()):
+        x, y = np.mean(tails, axis=0).tolist()
+        tags.append(Tag(x, y, f"{', '.join(names)} {azimuths[0]}°", THEME["doubt"]))
     parts += draw_tags(tags, width, height, 13.0)
+    parts.append(text(width - 12.0, height - 14.0, "azimuth: x → 0°, y ↑ 90°", 11.0, SOFT, text_anchor="end"))
     parts.append(line(np.array([(12.0, height - 12.0), (12.0 + 0.5 * scale, height - 12.0)]), SOFT, 2.0))
     parts.append(text(12.0, height - 22.0, "0.5 m", 11.0, SOFT, text_anchor="start"))
-    return Picture("where the robot stood", width, height, parts)
+    return Picture("the scene from above", width, height, parts)
 
 
 def draw_sphere(step: Step) -> Picture:
@@ -393,7 +406,7 @@ def _painted(step: Step) -> tuple[NDArray[np.uint8], Array]:
 def draw_chart(
     title: str, y_name: str, lines: Mapping[str, Sequence[float]], top: float | None = None
 ) -> Picture:
-    """Draw lines over the numbers of views, the first on top and the others' marks larger.
+    """Draw lines over the numbers of views, the first on top and the others wider, so that all are visible.
 
     Args:
         title: What the chart shows.
@@ -423,8 +436,7 @@ def draw_chart(
     for k, (name, values) in reversed([*enumerate(lines.items())]):
         at, sample = places(np.arange(1, len(values) + 1), values), np.array([20.0 + 116.0 * k, 226.0])
         for course, marked in ((at, at), (sample + [(-14.0, 0.0), (14.0, 0.0)], [sample])):
-            dashes = ("none", "8 4", "2 4", "8 3 2 3")[k]
-            parts.append(line(course, colours.PALETTE[k], 2.0, stroke_dasharray=dashes))
-            parts += [dot(p, 3.0 + k, colours.PALETTE[k]) for p in marked if np.isfinite(p).all()]
+            parts.append(line(course, colours.PALETTE[k], 2.0 + 3.5 * k))
+            parts += [dot(p, 3.0 + 2.0 * k, colours.PALETTE[k]) for p in marked if np.isfinite(p).all()]
         parts.append(text(sample[0] + 20.0, sample[1], name, 11.0, SOFT, text_anchor="start"))
     return Picture(title, width, height, parts)

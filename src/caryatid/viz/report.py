@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import shutil
 import subprocess
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -42,6 +44,7 @@ from caryatid.viz.tables import (
     point_table,
     reason_table,
     sentence,
+    sides_to_see,
     support_table,
 )
 
@@ -72,8 +75,7 @@ class Figure:
         caption: Caption of the picture, or empty.
         share: Divisor of the page width: 2 = half of it.
         link: Anchor of the section it links to, or empty.
-        page: An HTML page that covers the picture on a screen, or empty.
-        page_caption: Caption of this page.
+        page: An HTML page that covers the picture on a screen, or empty; the caption is then for print.
     """
 
     heading: str
@@ -82,7 +84,6 @@ class Figure:
     share: int = 2
     link: str = ""
     page: str = ""
-    page_caption: str = ""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -91,7 +92,7 @@ class Section:
 
     Attributes:
         title: Heading.
-        text: Text below or beside the heading.
+        text: Text below or beside the heading, a paragraph a line.
         figures: Pictures, side by side if they fit.
         facts: Names and texts.
         tables: Tables, one below the other.
@@ -135,6 +136,7 @@ def make_report(
     steps: Iterable[Step],
     *,
     about: str = "",
+    answer: str = "",
     settings: Mapping[str, object] | None = None,
     scores: Sequence[Mapping[str, Any]] = (),
     strip: Sequence[Figure] = (),
@@ -147,6 +149,7 @@ def make_report(
         title: Heading of the report.
         steps: Steps that `explore` or `extract` yields; at least one.
         about: Conditions, version and date of the run.
+        answer: What was removed, what may be lifted first, how sure that is; the first line is the largest.
         settings: Names and values of the run's settings.
         scores: Values of the `Score` after each view by name; empty without ground truth.
         strip: Pictures of the lifts, in order.
@@ -169,9 +172,8 @@ def make_report(
         views.append(_view(step, news, f1, width, told))
         if step.view is not None:
             picture = draw_image(step.view, step.labels, step.graph, width // 2, shapes=False)
-            why = "the first view" if before is None else ""
-            if before is not None and before.decision is not None:
-                why = before.decision.why
+            chosen = None if before is None else before.decision
+            why = "the first view" if before is None else "" if chosen is None else chosen.why
             caption = textwrap.shorten(f"{sentence(why)} {sentence(news)}", 220, placeholder=" …")
             heading = " · ".join(filter(None, (views[-1].title, f1)))
             contacts.append(Figure(heading, picture, caption, 4, views[-1].anchor))
@@ -185,8 +187,8 @@ def make_report(
         raise ValueError("a report needs at least one view")
     if scores and len(scores) != len(seen):
         raise ValueError(f"{len(scores)} scores for {len(seen)} views")
-    removed = f"{count_of(len(strip), 'object')} removed. " if strip else ""
-    sections = [*_answer(last, shown, len(seen), scores[-1] if scores else None, width, removed)]
+    text = f"{answer} {census(last.graph)} after {count_of(len(seen), 'view')}.".strip()
+    sections = [*_answer(last, shown, text, scores[-1] if scores else None, width)]
     facts = [("Warning", sentence(warning)) for warning in warnings]
     facts += happened
     facts += [("Finished", sentence(last.stop))] if last.stop else []
@@ -199,23 +201,21 @@ def make_report(
     tables = [object_table(last.graph), support_table(last.graph)]
     tables += [reason_table(last.reasons, last.graph)] * bool(last.reasons)
     sections += [Section("Objects and supports", tables=tables, folded=True), *views]
-    words = {None: "not set", True: "on", False: "off"}
-    given = (settings or {}).items()
-    named = ((name, words[v] if v is None or isinstance(v, bool) else str(v)) for name, v in given)
+    words = {"None": "not set", "True": "on", "False": "off"}
+    named = ((name, words.get(str(value), str(value))) for name, value in (settings or {}).items())
     source = Table.of("Source and options", ("name", "value"), named)
     sections.append(Section("Settings", tables=[source], folded=True))
     return Report(title, about, sections)
 
 
 def _answer(
-    step: Step, shown: Step, views: int, score: Mapping[str, Any] | None, width: int, before: str
+    step: Step, shown: Step, text: str, score: Mapping[str, Any] | None, width: int
 ) -> Iterator[Section]:
     """The final graph beside the view of the step that shows most objects, in 3D, and what is doubtful."""
-    graph, truth, facts = step.graph, score or {}, []
-    text = f"{before}{census(graph)} after {count_of(views, 'view')}."
-    if score is not None:
-        text += f" F1 {truth['f1']:.3f}, precision {truth['precision']:.3f}, recall {truth['recall']:.3f}."
-    if "wrong" in truth:
+    graph, truth, facts = step.graph, {"wrong": (), "missing": ()} | dict(score or {}), []
+    if step.removal is not None:
+        facts.append((f"Without {step.removal.object_id}", f"{step.removal}."))
+    if "matches" in truth:
         errors = {
             "wrong supports": [f"{a} → {b}" for a, b in truth["wrong"]],
             "missing supports": [f"{a} → {b}" for a, b in truth["missing"]],
@@ -223,55 +223,48 @@ def _answer(
             "missing objects": truth["unfound"],
         }
         listed = "; ".join(f"{name}: {', '.join(names)}" for name, names in errors.items() if names)
-        facts.append(("Compared with the ground truth", sentence(listed or "nothing is wrong or missing")))
-    if step.removal is not None:
-        facts.insert(0, (f"Without {step.removal.object_id}", f"{step.removal}."))
-    picture, caption = draw_graph(graph, truth.get("wrong", ()), truth.get("missing", ())), SUPPORTS
-    if truth.get("wrong") or truth.get("missing"):
-        caption += " Red: wrong or missing, compared with the ground truth."
-    wide, azimuth = picture.width > WIDE, _first_azimuth(step)
-    supports = Figure("Support graph", picture, caption, share=1 if wide else 2)
+        known = f"F1 {truth['f1']:.3f}, precision {truth['precision']:.3f}, recall {truth['recall']:.3f}."
+        listed = f"{sentence(listed or 'nothing is wrong or missing')} {known}"
+        facts.append(("Compared with the ground truth", listed))
+    red = " Red: wrong or missing, compared with the ground truth." * bool(truth["wrong"] or truth["missing"])
+    supports = _graph_figure(graph, SUPPORTS + red, truth["wrong"], truth["missing"])
+    azimuth = _first_azimuth(step)
     solid, still = draw_cloud(step.cloud, graph, azimuth), "All points, with the fitted shapes."
     seen = Figure("Fused cloud", solid, still)
     if shown.view is not None:
         caption = f"View {shown.index + 1} with the final shapes; objects with pale names are not visible."
         seen = Figure("The objects", draw_image(shown.view, shown.labels, graph, width), caption)
-    yield Section("Answer", text, [supports, seen] if wide else [seen, supports], facts)
-    doubtful = doubts(graph)
+    yield Section("Answer", text, [supports, seen] if supports.share == 1 else [seen, supports], facts)
+    doubtful = [(lead, why) for lead, why, _ in doubts(graph)]
     text = f"Nothing: all supports and objects have a probability above {DOUBTFUL}, and all shapes fit."
     if any(s.probability is None for s in graph.supports):
         text = "The probability of supports is unknown: it is not part of the rules of the paper."
     elif doubtful:
-        text = ""
+        text = "Arrows on the map below show from which azimuths to look." if sides_to_see(graph) else ""
     yield Section("What is doubtful", text, facts=doubtful)
     if graph.objects:
-        caption = "Drag to rotate, scroll to zoom. Arrows are visible through objects; orange: doubtful."
-        page = scene_3d_html(graph, azimuth)
-        figure = Figure("", solid, still, share=1, page=page, page_caption=caption)
-        yield Section("In 3D", figures=[figure])
+        yield Section("In 3D", figures=[Figure("", solid, still, 1, page=scene_3d_html(graph, azimuth))])
+
+
+def _graph_figure(graph: SupportGraph, caption: str, *errors: Collection[Sequence[str]]) -> Figure:
+    """The support graph, beside another picture if it can be read there."""
+    picture = draw_graph(graph, *errors)
+    return Figure("Support graph", picture, caption, share=1 if picture.width > WIDE else 2)
 
 
 def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list[Figure]:
-    """Scores and what was found, over views; and where the robot stood."""
-    charts = []
+    """Scores over views, where the robot stood, and from where to look."""
+    figures = []
     if scores:
         lines = {name: [s[name.lower()] for s in scores] for name in ("F1", "precision", "recall")}
-        charts.append(draw_chart("F1 over views", "share", lines, top=1.0))
-    if len(steps) > 1:
-        graphs = [step.graph for step in steps]
-        found = {
-            "objects": [sum(o.role == "object" for o in graph.objects) for graph in graphs],
-            "supports": [len(graph.supports) for graph in graphs],
-            "doubtful supports": [sum(s.doubtful for s in graph.supports) for graph in graphs],
-        }
-        charts.append(draw_chart("Found so far", "number", found))
-    figures = [Figure("", chart, share=3) for chart in charts]
-    if any(step.robot is not None for step in steps):
+        figures.append(Figure("", draw_chart("F1 over views", "share", lines, top=1.0), share=3))
+    sides = sides_to_see(steps[-1].graph)
+    if sides or any(step.robot is not None for step in steps):
         caption = (
-            "Seen from above, y up: platform (or arm base) and camera direction at each view, and the "
-            "platform's path."
+            "From above: platform (or arm base) and camera direction at each view, and the platform's path."
         )
-        figures.append(Figure("Robot poses", draw_stands(steps), caption, 3))
+        caption += " Orange: from where unseen sides of what is doubtful can be seen." * bool(sides)
+        figures.append(Figure("Map", draw_stands(steps, sides), caption, 3))
     return figures
 
 
@@ -281,10 +274,8 @@ def _view(step: Step, news: str, f1: str, width: int, happened: Sequence[tuple[s
     if step.lift is not None:
         facts.append((f"Removed {step.lift.object_id}", sentence(step.lift.why)))
     if decision is not None:
-        scores = (
-            f"saliency {decision.saliency:.2f}, path cost {decision.cost:.2f}, score {decision.score:.2f}"
-        )
-        facts.append(("Next view", f"{decision.why.rstrip('.')} ({scores})."))
+        known = f"saliency {decision.saliency:.2f}, path cost {decision.cost:.2f}, score {decision.score:.2f}"
+        facts.append(("Next view", f"{decision.why.rstrip('.')} ({known})."))
         tables += [point_table(decision)] * bool(decision.points_of_interest)
     text = " · ".join(filter(None, (step.name, census(step.graph), f1, news)))
     return Section(f"View {step.index + 1}", text, _figures(step, width), facts, tables, folded=True)
@@ -307,8 +298,7 @@ def _figures(step: Step, width: int) -> list[Figure]:
         )
         picture = draw_image(view, step.labels, graph, width)
         figures.append(Figure("Camera image", picture, caption))
-    picture = draw_graph(graph)
-    figures.append(Figure("Support graph", picture, SUPPORTS, share=1 if picture.width > WIDE else 2))
+    figures.append(_graph_figure(graph, SUPPORTS))
     caption = (
         f"{len(cloud):,} fused points, coloured by object, with the fitted shapes. Pale: the inside of a "
         "surface whose outside is unseen."
@@ -320,10 +310,9 @@ def _figures(step: Step, width: int) -> list[Figure]:
             "lead from points of interest to the views that show them best. Numbers: views so far."
         )
         if step.candidates is not None:
-            counts = step.candidates.rejected.items()
-            refused = ", ".join(f"{count:,} {reason}" for reason, count in counts)
+            refused = [f"{count:,} {reason}" for reason, count in step.candidates.rejected.items()]
             caption += f" {len(step.candidates):,} views are reachable"
-            caption += f"; rejected: {refused}." if refused else "."
+            caption += f"{'; rejected: ' * bool(refused)}{', '.join(refused)}."
         figures.append(Figure("Next best view", draw_sphere(step), caption))
     return figures
 
@@ -411,8 +400,20 @@ def template(name: str) -> jinja2.Template:
 
 
 def render_html(report: Report) -> str:
-    """Write a report as one self-contained HTML file."""
-    return template("page.html.jinja").render(report=report, svg=picture_svg)
+    """Write a report as one self-contained HTML file; ids lead to the rows of their objects."""
+    rows = [row for section in report.sections for table in section.tables for row in table.rows]
+    ids = sorted({row[0].about for row in rows if re.fullmatch(r"[os]\d+", row[0].about)})
+    known = "|".join(ids) or "(?!)"
+
+    def link(text: str) -> str:
+        return re.sub(rf"\b({known})\b", r'<a href="#\1">\1</a>', escape(text))
+
+    def svg(picture: Picture) -> str:
+        vertex = rf'<g class="node ({known})\b.*?</g>'
+        drawn, links = re.subn(vertex, r'<a href="#\1">\g<0></a>', picture_svg(picture))
+        return drawn.replace('role="img"', 'role="group"', 1) if links else drawn
+
+    return template("page.html.jinja").render(report=report, svg=svg, link=link, ids=ids)
 
 
 def find_chromium() -> str | None:

@@ -24,12 +24,18 @@ if TYPE_CHECKING:
 
 LETTER = 0.024
 """Height of a name plate [m]."""
-_CHECK = (
-    "<script>if (!document.createElement('canvas').getContext('webgl2')) {"
-    "document.body.style.background = 'white'; document.body.replaceChildren("
-    "'This browser cannot show 3D: WebGL is missing or disabled.');}</script>"
-)
-"""Says so in place of the shapes where the browser cannot draw them."""
+_CONTROLS = """<style> body { background: none; } canvas { visibility: hidden; } p { position: absolute;
+top: 0; margin: 8px; color: #5d666f; font: 13px system-ui, sans-serif; }</style>
+<p hidden>Drag to rotate, scroll to zoom. Arrows are visible through objects; orange: doubtful.
+<button onclick="controls.reset()">Reset</button></p><script> const told = document.querySelector('p');
+function shown() { if (!window.controls) { requestAnimationFrame(shown); return; }
+controls.target0.copy(controls.target); render(); told.hidden = false;
+document.querySelector('canvas').style.visibility = 'visible'; document.body.style.background = 'white'; }
+if (document.createElement('canvas').getContext('webgl2')) new IntersectionObserver(([page]) =>
+page.isIntersecting && told.hidden && shown()).observe(document.documentElement);
+else { told.textContent = 'This browser cannot show 3D: WebGL is missing or disabled.'; told.hidden = false; }
+</script>"""
+"""Shows the shapes once they are in sight, and until then what is behind the page; or says why it cannot."""
 
 
 def make_scene(
@@ -108,17 +114,21 @@ def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
     T_file_camera = transforms.look_at(eye, centre, (0.0, 1.0, 0.0))
     scene.camera_transform = T_file_camera @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along −z.
     page: str = scene_to_html(scene)
-    return page.replace("</body>", f"{_CHECK}</body>")
+    return page.replace("</body>", f"{_CONTROLS}</body>")
 
 
 def support_ends(support: Support, graph: SupportGraph) -> tuple[Array, Array]:
-    """Where the arrow of a support begins and ends (3,); from a surface it rises, from 7 cm below it."""
-    supporter, supported = graph[support.supporter], graph[support.supported]
-    start, end, contact = supporter.centre_world, supported.centre_world, support.contact_world
-    if supporter.role == "support_surface":
-        start = np.array([*(end if contact is None else contact)[:2], start[2] - 0.07])
-    if supported.role == "support_surface":
-        end = np.array([*(start if contact is None else contact)[:2], end[2]])
+    """Where the arrow of a support begins and ends (3,): up to 3 cm on both sides of its contact.
+
+    That of a support surface begins on it. Where the contact is unknown, it runs from centre to centre.
+    """
+    ends, along = [graph[support.supporter], graph[support.supported]], support.normal_world
+    start, end, surface = ends[0].centre_world, ends[1].centre_world, ends[0].role == "support_surface"
+    if support.contact_world is not None and along is not None:
+        low, high = (along * min(0.03, np.ptp(o.shape.outline() @ along) / 2.0) for o in ends)
+        return support.contact_world - (not surface) * low, support.contact_world + high
+    if surface:
+        start = np.array([*end[:2], start[2] + ends[0].shape.extents.min() / 2.0])
     return start, end
 
 

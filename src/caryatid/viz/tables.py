@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from caryatid.geometry.shapes import Cylinder, Shape, Sphere
+from caryatid.geometry.shapes import Cylinder, Shape, Sphere, Uncertainty
 from caryatid.graph import DOUBTFUL, Change, SceneObject, SupportGraph, label_of
 from caryatid.viz.colours import object_colour, saliency_colour
 
@@ -19,11 +19,12 @@ if TYPE_CHECKING:
 
 
 class Entry(NamedTuple):
-    """One cell of a table: its text, the colour `#rrggbb` of the chip before it, whether it is doubtful."""
+    """One cell of a table: text, colour `#rrggbb` of the chip before it, doubt; the id its row is about."""
 
     text: str
     colour: str = ""
     doubt: bool = False
+    about: str = ""
 
 
 class Table(NamedTuple):
@@ -51,16 +52,21 @@ def _object_row(item: SceneObject, graph: SupportGraph) -> dict[str, str | Entry
     faces = ("−x", "+x", "−y", "+y", "−z", "+z")
     unseen = " ".join(face for face, seen in zip(faces, item.seen, strict=True) if not seen)
     supporters = ", ".join(s.supporter + "?" * s.doubtful for s in graph.supporters(item.id))
-    verdict, ratio, overhang = "–" if surface else "not tested", "–", "–"
+    verdict = "–" if surface else "not tested"
     if stability is not None:
         found = ["small area"] * stability.small_area + ["tips"] * stability.tips
-        verdict, ratio = ", ".join(found) or "stable", f"{stability.ratio:.2f}"
-        if np.isfinite(stability.overhang):
-            overhang = f"{1e3 * stability.overhang:.0f}".replace("-", "−")
+        overhang = f", overhang\u00a0{1e3 * stability.overhang:.0f}" * bool(np.isfinite(stability.overhang))
+        verdict = f"{', '.join(found) or 'stable'}; r_s\u00a0{stability.ratio:.2f}" + overhang.replace(
+            "-", "−"
+        )
+    centre = ",\u00a0".join(str(round(1e3 * x)) for x in item.centre_world.tolist()).replace("-", "−")
+    if item.uncertainty is not None:
+        centre += f" ±\u00a0{1e3 * item.uncertainty.position.max():.2g}"
     return {
-        "id": Entry(item.title, object_colour(item.label)),
+        "id": Entry(item.title, object_colour(item.label), about=item.id),
         "shape": item.shape.kind,
-        "size [mm]": size_of(item.shape),
+        "size ± σ [mm]": size_of(item.shape, item.uncertainty),
+        "centre ± σ [mm]": centre,
         "in views": f"{item.occurrences} of {item.opportunities}",
         "probability": "–" if item.probability is None else f"{item.probability:.2f}",
         "sides unseen": (unseen or "none") if any(item.seen) else "all",
@@ -69,9 +75,7 @@ def _object_row(item: SceneObject, graph: SupportGraph) -> dict[str, str | Entry
         ),
         "supported by": "–" if surface else supporters or "unknown",
         "stability": Entry(verdict, doubt=stability is not None and not stability.stable),
-        "r_s": ratio,
-        "overhang [mm]": overhang,
-        "origin": f"{item.why}; doubtful: {item.doubt}" if item.doubt else item.why,
+        "evidence": "; ".join(filter(None, (item.why, f"doubtful: {item.doubt}" * bool(item.doubt)))),
     }
 
 
@@ -149,14 +153,29 @@ def order_table(order: Order, *, brief: bool = False) -> Table:
     return Table.of("Steps", ("", "remove", "hold", "probability", "reason"), rows)
 
 
-def size_of(shape: Shape) -> str:
-    """Return the size of a shape as text [mm]."""
-    match shape:
-        case Cylinder():
-            return f"⌀ {2e3 * shape.radius:.0f} × {1e3 * shape.height:.0f}"
-        case Sphere():
-            return f"⌀ {2e3 * shape.radius:.0f}"
-    return " × ".join(f"{1e3 * e:.0f}" for e in shape.extents)
+def tell_lifts(lifts: Sequence[Mapping[str, Any]], order: Order | str, graph: SupportGraph) -> str:
+    """Say what was removed (`lifts` of run.json), and what may be lifted first, how surely; and why."""
+    done = [lift for lift in lifts if lift["body"] is not None]
+    names = (x["object"] + "".join(f" ({held} held)" for held in x["held"]) for x in done)
+    moved = "; ".join(f"{', '.join(x['disturbed'])} moved with {x['object']}" for x in done if x["disturbed"])
+    text = f"Removed, in this order: {', '.join(names)}; {moved or 'nothing else moved'}. " if done else ""
+    if isinstance(order, str) or not order.steps:
+        why = order if isinstance(order, str) else order.refusal
+        return text + f"No safe lift is known.\n{sentence(why)}" * bool(why)
+    step, hold = order.steps[0], " and ".join(graph[i].title for i in order.steps[0].hold)
+    name = graph[step.object_id].title + f" while the other hand holds {hold}" * bool(hold)
+    what = f"Lift {name} {'next' if done else 'first'}"
+    text += what if step.safe else f"No lift is safe. The least risky is to lift {name}"
+    why = sentence("; ".join(filter(None, (step.why, order.refusal))))
+    return f"{text}: nothing else moves with probability {1.0 - step.risk:.2f}.\n{why}"
+
+
+def size_of(shape: Shape, uncertainty: Uncertainty | None = None) -> str:
+    """Return the size of a shape as text [mm], with its standard deviations if they are given."""
+    axes = (0, 2) if isinstance(shape, Cylinder) else (0,) if isinstance(shape, Sphere) else (0, 1, 2)
+    sigma = ["", "", ""] if uncertainty is None else [f"±{1e3 * x:.2g}" for x in uncertainty.sizes]
+    sizes = [f"{1e3 * shape.extents[axis]:.0f}{sigma[axis]}" for axis in axes]
+    return "⌀ " * isinstance(shape, Cylinder | Sphere) + " × ".join(sizes)
 
 
 def count_of(number: int, name: str) -> str:
@@ -174,18 +193,18 @@ def census(graph: SupportGraph) -> str:
     return f"{text}, {doubtful} of them doubtful" if doubtful else text
 
 
-def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
-    """List doubtful supports and objects with the reason and a view that would help, most doubtful first.
+def doubts(graph: SupportGraph) -> list[tuple[str, str, tuple[str, ...]]]:
+    """List doubtful supports and objects, why and what view would help, with ids; most doubtful first.
 
     An object is doubtful if it has no known supporter, its shape fits poorly or is implausible, or the
     probability that its pose and size are about right is low. What both of two objects are doubtful for, such
     as an overlap, is listed once.
     """
-    found, told = [], set[tuple[str, frozenset[str]]]()
+    found, told = list[tuple[str, str, tuple[str, ...]]](), set[tuple[str, frozenset[str]]]()
     for s in sorted(graph.supports, key=lambda s: abs(s.belief - 0.5)):
         if s.doubtful:
             lead = f"{graph[s.supporter].title} → {graph[s.supported].title}, probability {s.belief:.2f}"
-            found.append((lead, f"{s.why.rstrip('.')}. {_settled_by(graph, s.supporter, s.supported)}"))
+            found.append((lead, f"{s.why.rstrip('.')}. {_settled_by(graph, *s.pair)}", s.pair))
     for item in graph.objects:
         poor = f"the points are {1e3 * item.residual:.1f} mm off the shape on average"
         known = item.role == "support_surface" or graph.supporters(item.id)
@@ -199,25 +218,30 @@ def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
         if item.probability is not None and item.probability <= DOUBTFUL:
             reasons.append(f"its pose and size are about right with probability {item.probability:.2f} only")
         if reasons:
-            found.append((item.title, f"{'; '.join(reasons)}. {_settled_by(graph, item.id)}"))
+            found.append((item.title, f"{'; '.join(reasons)}. {_settled_by(graph, item.id)}", (item.id,)))
     return found
+
+
+def sides_to_see(graph: SupportGraph) -> list[tuple[SceneObject, int]]:
+    """List unseen sides of what is doubtful: objects, and the azimuth [°] from where one can be seen."""
+    items = {name: graph[name] for *_, ids in doubts(graph) for name in ids}.values()
+    return [(item, side) for item in items for side in _unseen(item) if side is not None]
+
+
+def _unseen(item: SceneObject) -> list[int | None]:
+    """Azimuths [°] from where unseen sides of an object can be seen; None is above."""
+    if item.role == "support_surface" or not any(item.seen):
+        return []
+    R = item.shape.T_world_object[:3, :3]
+    outward = np.stack([-R.T, R.T], axis=1).reshape(6, 3)  # −x, +x, −y, …
+    sides = outward[~np.array(item.seen) & (outward[:, 2] > -0.5)]
+    return [None if z > 0.8 else round(float(np.degrees(np.arctan2(y, x)))) % 360 for x, y, z in sides]
 
 
 def _settled_by(graph: SupportGraph, *ids: str) -> str:
     """Where to look to see the unseen sides of objects."""
-    views = []
-    for item in (graph[name] for name in ids):
-        if item.role == "support_surface" or not any(item.seen):
-            continue
-        R = item.shape.T_world_object[:3, :3]
-        outward = np.stack([-R.T, R.T], axis=1).reshape(6, 3)  # −x, +x, −y, …
-        sides = outward[~np.array(item.seen) & (outward[:, 2] > -0.5)]
-        places = [
-            "above" if z > 0.8 else f"azimuth {round(float(np.degrees(np.arctan2(y, x)))) % 360}°"
-            for x, y, z in sides
-        ]
-        if places:
-            views.append(f"{item.id} from {' and '.join(places)}")
+    sides = {i: ["above" if a is None else f"azimuth {a}°" for a in _unseen(graph[i])] for i in ids}
+    views = [f"{name} from {' and '.join(places)}" for name, places in sides.items() if places]
     if views:
         return f"Look at {'; '.join(views)}: no view shows that side."
     return "All visible sides were seen; the rest is noise, or hidden between objects."
@@ -236,7 +260,7 @@ def describe(graph: SupportGraph) -> str:
     holding = {s.supporter for s in graph.supports}
     free = [o.title for o in graph.objects if o.role == "object" and o.id not in holding]
     lines.append(f"support nothing (`caryatid order` rehearses lifting them): {', '.join(free) or 'none'}")
-    doubtful = [f"- {lead}: {reason}" for lead, reason in doubts(graph)]
+    doubtful = [f"- {lead}: {reason}" for lead, reason, _ in doubts(graph)]
     return "\n".join([*lines, f"doubtful: {'' if doubtful else 'nothing'}".rstrip(), *doubtful]) + "\n"
 
 
