@@ -88,6 +88,7 @@ docs: $(VENV)/.docs
 pictures: install
 	$(BIN)/python docs/pictures/draw.py concepts
 	$(BIN)/python docs/pictures/draw.py viewer
+	$(BIN)/python docs/pictures/draw.py report
 
 gif: install
 	$(BIN)/python docs/pictures/draw.py film

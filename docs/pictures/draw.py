@@ -1,8 +1,9 @@
-"""Draw the documentation's pictures: each stage of the loop on one scene, README.md's film, and the viewer.
+"""Draw the documentation's pictures: stages of the loop on one scene, README.md's film, viewer and report.
 
     python docs/pictures/draw.py concepts
     python docs/pictures/draw.py film
     python docs/pictures/draw.py viewer
+    python docs/pictures/draw.py report
 
 The first two commands draw with `caryatid.viz`, like reports; all take screenshots in Chromium.
 """
@@ -18,6 +19,7 @@ from dataclasses import replace
 from functools import partial
 from html import escape
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -25,7 +27,7 @@ import tyro
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from caryatid import Config, Step, explore
+from caryatid import Config, Step, cli, explore
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry import transforms
@@ -254,8 +256,20 @@ def viewer(browser: Any) -> Iterator[tuple[str, Image.Image]]:
         yield "phone", shot(tab)
 
 
-def main(what: Annotated[Literal["concepts", "film", "viewer"], tyro.conf.Positional]) -> None:
-    """Draw the pictures of docs/concepts.md, the film of README.md, or the viewer of docs/runs.md."""
+def report(browser: Any) -> Iterator[tuple[str, Image.Image]]:
+    """Take screenshots of reports: a safe lift, none that is safe, and where to look."""
+    page = browser.new_page(viewport={"width": 1280, "height": 740})
+    for name, scene, views in (("safe", "clutter", 5), ("unsafe", "blocks-6-0", 2), ("map", "clutter", 1)):
+        with TemporaryDirectory() as folder:
+            run = Path(folder) / "run"
+            assert cli.main(["explore", scene, "--views", str(views), "--out", str(run), "--quiet"]) == 0
+            page.goto((run / "report.html").as_uri())
+        shown = page.locator("figure:has-text('Map')").last if name == "map" else page
+        yield name, Image.open(io.BytesIO(shown.screenshot())).convert("RGB")
+
+
+def main(what: Annotated[Literal["concepts", "film", "viewer", "report"], tyro.conf.Positional]) -> None:
+    """Draw the pictures of docs/concepts.md, the film of README.md, or viewer or report of docs/runs.md."""
     known: dict[str, Any] = {"method": Image.Quantize.MEDIANCUT, "dither": Image.Dither.NONE}
     with chromium() as browser:
         if what == "film":
@@ -264,9 +278,10 @@ def main(what: Annotated[Literal["concepts", "film", "viewer"], tyro.conf.Positi
             file = PICTURES / "explore.gif"
             first.save(file, save_all=True, append_images=others, duration=times, loop=0, optimize=False)
             return
-        pictures = viewer(browser) if what == "viewer" else concepts(browser.new_page()).items()
+        shots = {"viewer": viewer, "report": report}
+        pictures = shots[what](browser) if what in shots else concepts(browser.new_page()).items()
         for name, image in pictures:
-            file = f"viewer-{name}.png" if what == "viewer" else f"concepts/{name}.png"
+            file = f"{what}-{name}.png" if what in shots else f"concepts/{name}.png"
             image.quantize(256, **known).save(PICTURES / file, optimize=True)
 
 
