@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import sys
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from typing import Annotated, Literal
@@ -43,7 +44,7 @@ from caryatid.graph import Grasp, TakeStep
 from caryatid.manipulation.clearing import SimulatedHands, Taken, clear
 from caryatid.manipulation.grasps import gripper_boxes, turn_of
 from caryatid.manipulation.order import plan_order
-from caryatid.simulation.lifting import Lifting
+from caryatid.simulation.lifting import ASIDE, Lifting
 from caryatid.simulation.world import SimulatedScene, poses_of, quaternion
 
 
@@ -73,7 +74,7 @@ class Clear(OnScenes):
         config, wanted = read_settings(None, self.set), None if goal is None else f"o{goal}"
         camera, explorer = self.start(scene, config)
         hands, done = SimulatedHands(scene, config), list[Taken]()
-        grasps = list[tuple[list[str], bool]]()
+        grasps, ways = list[tuple[list[str], bool]](), list[float]()
 
         def take(step: TakeStep) -> bool:
             before, bodies = hands.state, hands.bodies(explorer.scene.graph)
@@ -81,6 +82,8 @@ class Clear(OnScenes):
             if step.grasp is not None and body in hands.left:
                 grasps.append(grasped(scene, before, step.grasp, body, config.gripper))
             done.append(hands.take(step, bodies))
+            if body in hands.names:
+                ways.append(translation([before, *done[-1].film], hands.names.index(body)))
             camera.scene = hands.scene
             return done[-1].body is not None
 
@@ -98,6 +101,7 @@ class Clear(OnScenes):
         harm = [f"{t.step.object_id}: {', '.join(t.disturbed)}" for t in lifted if not t.ok]
         row = {"scene": name, "objects": len(scene.object_bodies), "lifts": len(lifted), "views": len(steps)}
         row |= {"missed": len(done) - len(lifted), "harmed": len(harm), "harm": harm}
+        row["way"] = sum(ways)
         row |= {"stop": steps[-1].stop, "grasps": len(grasps), "clear": sum(not t for t, _ in grasps)}
         row |= {"held": sum(held for _, held in grasps), "touched": [t for t, _ in grasps if t]}
         if goal is None:
@@ -113,6 +117,7 @@ class Clear(OnScenes):
         found |= {"both": (unharmed & (rows["cleared"] == 1.0)).mean()}
         found |= {"lifts unharmed": 1.0 - rows["harmed"].sum() / rows["lifts"].sum()}
         found |= {"harmful lifts": rows["harmed"].sum()}
+        found |= {"moved per lift, cm": 100.0 * rows["way"].sum() / rows["lifts"].sum()}
         found |= {"views per lift": rows["views"].sum() / rows["lifts"].sum(), "missed": rows["missed"].sum()}
         if rows["grasps"].sum():
             found |= {f"grasps {name}": rows[name].sum() / rows["grasps"].sum() for name in ("clear", "held")}
@@ -189,6 +194,18 @@ def grasped(
             reach = min(mujoco.mj_geomDistance(model, data, disc, int(g), 0.1, None) for g in solid)
     rise = data.qpos[qpos[body] + 2] - height
     return sorted(touched), bool(rise > grasp.travel / 2.0 if closing else reach < 0.005)
+
+
+def translation(film: Sequence[Array], lifted: int) -> float:
+    """Sum of the ways [m] of all objects but the lifted one and those removed before.
+
+    This is the sum of translations of SafePicking (Wada et al., ICRA 2022). The film holds the states (N, 7)
+    before and during the lift.
+    """
+    places = np.array(film)[:, :, :3]
+    others = places[0, :, 2] < ASIDE / 2.0
+    others[lifted] = False
+    return float(np.linalg.norm(np.diff(places[:, others], axis=0), axis=-1).sum())
 
 
 def fewest(scene: SimulatedScene, goal: str, config: Config) -> int:

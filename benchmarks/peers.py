@@ -32,6 +32,9 @@ ITERATIONS = 1000
 NEIGHBOURS = 20
 """Number of points from which a normal is estimated."""
 
+GRAIN, FLAT, NEIGHBOURHOOD = 0.005, 0.01, 0.015
+"""Voxel of Open3D's clouds, distance within which points are on a plane, and radius of DBSCAN [m]."""
+
 _FOLDERS = re.compile(r"(?<![\w.])/(?:[^/\s'\"()]+/)+")
 _NUMBER = r"(-?[\d.]+(?:e[+-]?\d+)?)"
 _TRIPLE = rf"\({_NUMBER}, {_NUMBER}, {_NUMBER}\)"
@@ -81,10 +84,9 @@ def open3d_chain(view: View, max_depth: float) -> Callable[[], int]:
         cloud = o3d.geometry.PointCloud.create_from_depth_image(
             image, K, depth_scale=1.0, depth_trunc=max_depth
         )
-        cloud = cloud.voxel_down_sample(0.005)
-        _, table = cloud.segment_plane(distance_threshold=0.01, ransac_n=3, num_iterations=1000)
-        rest = cloud.select_by_index(table, invert=True)
-        clusters = np.asarray(rest.cluster_dbscan(eps=0.015, min_points=10))
+        cloud = cloud.voxel_down_sample(GRAIN)
+        _, rest = open3d_table(cloud)
+        clusters = open3d_clusters(rest)
         boxes = 0
         for k in range(clusters.max(initial=-1) + 1):
             cluster = rest.select_by_index(np.flatnonzero(clusters == k))
@@ -94,6 +96,24 @@ def open3d_chain(view: View, max_depth: float) -> Callable[[], int]:
         return boxes
 
     return chain
+
+
+def open3d_cloud(points: Array) -> Any:
+    """Return Open3D's cloud of points (N, 3) [m], one per voxel, and start its random numbers anew."""
+    o3d = _open3d()
+    o3d.utility.random.seed(0)
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(GRAIN)
+
+
+def open3d_table(cloud: Any) -> tuple[Array, Any]:
+    """Find the largest plane by RANSAC; return a, b, c, d of ax + by + cz + d = 0, and the other points."""
+    plane, inside = cloud.segment_plane(distance_threshold=FLAT, ransac_n=3, num_iterations=1000)
+    return np.asarray(plane), cloud.select_by_index(inside, invert=True)
+
+
+def open3d_clusters(cloud: Any) -> NDArray[np.int32]:
+    """Return the DBSCAN cluster (N,) of each point of a cloud, −1 for noise."""
+    return np.asarray(cloud.cluster_dbscan(eps=NEIGHBOURHOOD, min_points=10), dtype=np.int32)
 
 
 def open3d_box(points: Array) -> Callable[[], Estimate]:

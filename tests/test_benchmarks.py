@@ -15,6 +15,7 @@ from caryatid.errors import CaryatidError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
 from caryatid.graph import SceneObject, Support, SupportGraph, object_id
+from caryatid.io.bop import read_recording
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.scenes import is_builtin
 from caryatid.simulation.truth import GroundTruth, TrueEdge, write_truth
@@ -23,7 +24,9 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 import accuracy  # noqa: E402
+import clear  # noqa: E402
 import measures  # noqa: E402
+import others  # noqa: E402
 import real  # noqa: E402
 
 ROW = dict.fromkeys(SCORES, 1.0) | {"scene": "tower", "view": 5, "f1": 0.9, "edge_recall": 0.8}
@@ -180,3 +183,64 @@ def test_a_recording_of_several_views_is_scored_with_its_masks_and_without(recor
     assert labels["views"]["shape IoU"] > 0.8
     assert labels["masks"]["F1"] == labels["masks"]["AP"] == 1.0
     assert len(auto["masks"]["frames"]) == len(auto["ms"]) == 3
+
+
+def test_boundaries_agree_up_to_three_thousandths_of_the_diagonal():
+    assert [others.tolerance_of(np.zeros(size)) for size in ((480, 640), (720, 1280))] == [3.0, 5.0]
+
+
+def test_supports_of_unfound_and_invented_objects_lower_recall_and_precision():
+    labels, image = (1, 2, 3), squares((10, 10), (50, 10), (90, 40))
+    true = np.where(image == 3, 0, image)
+    edges = frozenset({("table", "object1"), ("object1", "object2"), ("object1", "object4")})
+    graph = graph_of(labels, (SUPPORT_LABEL, 1, 0.9), (2, 3, 0.8), (1, 2, 0.7))
+    row = others.score_pixels(graph, [image], [true], ("table", "object1", "object2", "object4"), edges)
+    found = others.rate(row["all"])
+    assert (found["P"], found["R"]) == (pytest.approx(200 / 3), pytest.approx(200 / 3))
+    assert found["AP"] == pytest.approx((1.0 + 2.0 / 3.0) / 3.0)  # right, wrong, right, and one never found
+    found = others.rate(row["on objects"])
+    assert (found["P"], found["R"], found["AP"]) == (50.0, 50.0, pytest.approx(0.25))
+
+
+def box(x, z, size=0.1, height=0.1):
+    """Corners of a box: x of its low corner, height of its bottom, side and height [m]."""
+    low = np.array([x, 0.0, z])
+    return low, low + (size, size, height)
+
+
+TOWER = {1: box(0.0, 0.0), 2: box(0.05, 0.11), 3: box(0.5, 0.0), 4: box(0.5, 0.2)}
+"""A box on the half of another, and one that floats 10 cm over a third."""
+
+
+def test_boxes_rest_on_what_they_nearly_touch_from_above_and_otherwise_on_the_table():
+    table = SUPPORT_LABEL
+    shares = {(1, 2): 0.5, (table, 1): 1.0, (table, 3): 1.0, (table, 4): 0.5}
+    assert others.rests_on(TOWER) == pytest.approx(shares)
+
+
+def test_orders_of_removal():
+    graph = others.graph_of_boxes(TOWER, np.eye(4))
+    assert others.order_by_height(graph) == ["o4", "o2", "o1", "o3"]
+    assert others.order_by_height(graph, "o1") == ["o4", "o2", "o1"]
+    assert others.order_by_supports(graph, "o1") == ["o2", "o1"]
+    assert others.order_by_supports(graph, "o3") == ["o3"]
+
+
+def test_the_way_of_others_does_not_count_the_lifted_and_the_removed():
+    """The first is lifted, the second goes 3 cm and 4 cm back, the third was removed before."""
+    film = np.zeros((3, 3, 7))
+    film[:, 0, 2], film[1:, 1, 0], film[2, 1, 1], film[:, 2, 2] = (
+        (0.0, 0.5, 50.0),
+        0.03,
+        0.04,
+        (52.0, 52.1, 53.0),
+    )
+    assert clear.translation(film, 0) == pytest.approx(0.07)
+
+
+def test_open3d_finds_what_lies_on_what_in_one_frame(single):
+    pytest.importorskip("open3d")
+    views = list(read_recording(single))
+    graph, labels = others.box_graph(views, "labels")
+    assert (labels[0] == np.where(views[0].valid, views[0].labels, 0)).mean() > 0.99
+    assert {s.pair for s in graph.supports} == {("o0", "o1"), ("o1", "o2")}
