@@ -50,7 +50,7 @@ from real import TRUTH, Annotation, Labels, Real, compare_masks, find_recordings
 from rich.console import Console
 from scipy.spatial import cKDTree
 
-from caryatid.benchmark.episodes import open_scene
+from caryatid.benchmark.episodes import open_scene, order_by_supports
 from caryatid.benchmark.suites import SUITES
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import CaryatidError
@@ -193,7 +193,7 @@ class Others(Spread):
                 (OURS, graph, [step.object_id for step in takewhile(lambda step: step.safe, order)]),
                 (f"{OURS}, unsafe lifts too", graph, [step.object_id for step in order]),
                 (HIGHEST, graph, order_by_height(graph, goal)),
-                (BOXES, boxes, order_by_supports(boxes, goal)),
+                (BOXES, boxes, order_by_boxes(boxes, goal)),
             ):
                 found = carry_out(scene, ids, seen, config, None if label is None else bodies[label])
                 rows.append(known | {"views": self.views, "method": made} | found)
@@ -417,23 +417,15 @@ def order_by_height(graph: SupportGraph, goal: str | None = None) -> list[str]:
     return ids[: ids.index(goal) + 1] if goal in ids else ids
 
 
-def order_by_supports(graph: SupportGraph, goal: str | None = None) -> list[str]:
-    """Return the objects of a graph, or a goal and those above it, so that none leaves before what it holds.
+def order_by_boxes(graph: SupportGraph, goal: str | None = None) -> list[str]:
+    """Return the objects of a graph, or a goal and all that rests on it, so that none leaves before its load.
 
-    Among those that hold nothing, the highest goes first; it goes too if every object holds another.
+    Among those without a load, the highest goes first.
     """
-    left, done = order_by_height(graph), list[str]()
-    pairs = [s.pair for s in graph.supports]
-    if goal is not None and goal in left:
-        above = {goal}
-        while more := {b for a, b in pairs if a in above} - above:
-            above |= more
-        left = [id for id in left if id in above]
-    while left:
-        holding = {a for a, b in pairs if b in left}
-        done.append(next((id for id in left if id not in holding), left[0]))
-        left.remove(done[-1])
-    return done
+    ids, pairs, above = order_by_height(graph), [s.pair for s in graph.supports], {goal}
+    while more := {b for a, b in pairs if a in above} - above:
+        above |= more
+    return order_by_supports([i for i in ids if goal not in ids or i in above], pairs)
 
 
 def sum_up(rows: Sequence[Row]) -> pd.DataFrame:

@@ -222,8 +222,8 @@ def test_orders_of_removal():
     graph = others.graph_of_boxes(TOWER, np.eye(4))
     assert others.order_by_height(graph) == ["o4", "o2", "o1", "o3"]
     assert others.order_by_height(graph, "o1") == ["o4", "o2", "o1"]
-    assert others.order_by_supports(graph, "o1") == ["o2", "o1"]
-    assert others.order_by_supports(graph, "o3") == ["o3"]
+    assert others.order_by_boxes(graph, "o1") == ["o2", "o1"]
+    assert others.order_by_boxes(graph, "o3") == ["o3"]
 
 
 def test_the_way_of_others_does_not_count_the_lifted_and_the_removed():

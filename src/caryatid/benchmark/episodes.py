@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from importlib.util import find_spec
@@ -191,7 +191,8 @@ def _take_apart(
         if order == "random":
             ids = [objects[k].id for k in np.random.default_rng(seed).permutation(len(objects))]
         elif order == "true graph":
-            ids = _by_graph(ids, truth.edges, bodies)
+            true = {(i, k) for i in ids for k in ids if (bodies.get(i), bodies.get(k)) in truth.edges}
+            ids = order_by_supports(ids, true)
         steps = [TakeStep(i, (), False, 1.0, "not rehearsed") for i in ids]
     steps = [step for step in steps if step.object_id in bodies]
     height = dict(zip(scene.object_bodies.values(), poses_of(scene)[:, 2], strict=True))
@@ -200,6 +201,16 @@ def _take_apart(
     hands, known = SimulatedHands(scene, config), bodies | {b: b for b in missed}
     ok = [hands.take(step, known).ok for step in steps]
     return {"unharmed": float(all(ok)), "lifts": float(np.mean(ok))}
+
+
+def order_by_supports(ids: Sequence[str], supports: Iterable[tuple[str, str]]) -> list[str]:
+    """Reorder ids so that those that support nothing that is left go first, and otherwise as they are."""
+    left, done, supports = list(ids), list[str](), list(supports)
+    while left:
+        holding = {supporter for supporter, supported in supports if supported in left}
+        done.append(next((i for i in left if i not in holding), left[0]))
+        left.remove(done[-1])
+    return done
 
 
 def figures_of(found: Score, graph: SupportGraph, true: int) -> Row:
@@ -232,16 +243,6 @@ def _rows(episode: Episode) -> list[Row]:
         planning = step.timings.get("plan", 0.0)
     missing = range(int(rows[-1]["view"]) + 1, episode.views + 1)
     return rows + [rows[-1] | dict.fromkeys(TIMES, 0.0) | {"view": view} for view in missing]
-
-
-def _by_graph(ids: Sequence[str], edges: frozenset[tuple[str, str]], bodies: Mapping[str, str]) -> list[str]:
-    """Ids, highest first, reordered so that objects that carry nothing go first."""
-    left, done = list(ids), []
-    while left:
-        carrying = {i for i in left for k in left if (bodies.get(i), bodies.get(k)) in edges}
-        done.append(next((i for i in left if i not in carrying), left[0]))
-        left.remove(done[-1])
-    return done
 
 
 def _digest(files: Iterable[Path]) -> str:
