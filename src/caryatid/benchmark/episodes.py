@@ -208,8 +208,7 @@ def order_by_supports(ids: Sequence[str], supports: Iterable[tuple[str, str]]) -
     left, done, supports = list(ids), list[str](), list(supports)
     while left:
         holding = {supporter for supporter, supported in supports if supported in left}
-        done.append(next((i for i in left if i not in holding), left[0]))
-        left.remove(done[-1])
+        done.append(left.pop(next((n for n, i in enumerate(left) if i not in holding), 0)))
     return done
 
 
