@@ -47,8 +47,6 @@ ARROW = {"shaft_radius": 0.0035, "head_radius": 0.0095, "head_length": 0.02}
 """Sizes of an arrow [m]."""
 OPACITY, FAINT = 0.55, 0.2
 """Of objects, through which arrows can be seen; and of all that is not chosen [1]."""
-CLEAR = 0.012
-"""Between the end of an arrow and the centre of its object, where its name is [m]."""
 SCREEN: dict[str, Any] = {"thickness": 1.6, "thickness_units": "screen"}
 MATT: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 
@@ -271,7 +269,7 @@ class SceneDrawing:
         return [grid, *self._lines("/grid/axes", axes.swapaxes(0, 1), colours, **SCREEN)]
 
     def _supports(self, graph: SupportGraph) -> list[Any]:
-        """Arrows from centre to centre, which show through the shapes; of surfaces only if doubtful."""
+        """Arrows at contacts, which show through the shapes; of surfaces only if doubtful."""
         nodes: list[Any] = []
         for number, support in enumerate(graph.supports):
             if graph[support.supporter].role == "support_surface" and not support.doubtful:
@@ -281,8 +279,6 @@ class SceneDrawing:
             length = float(np.linalg.norm(along))
             if length < 1e-6:
                 continue
-            gap = min(CLEAR / length, 0.3)  # Names stay readable.
-            start, end = start + gap * along, end - gap * along
             colour, share = DOUBTFUL if support.doubtful else SURE, max(support.belief, 0.3)
             neck = start
             if support.doubtful:
