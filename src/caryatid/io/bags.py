@@ -73,18 +73,17 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     depths = bag.images(depth_topic, partial(decode_depth, max_pixels=config.max_pixels, unit=unit))
     colour = partial(decode_colour, max_pixels=config.max_pixels)
     colours = None if rgb_topic is None else bag.images(rgb_topic, colour)
-    tree = None
+    poses = None
     if options.world is None:
         notes.insert(0, "no --tf FRAME: poses are unknown, so only one frame is imported")
     else:
-        tree = bag.transforms(config.pose_gap)
+        poses = bag.transforms(config.pose_gap), options.world
         for frame in dict.fromkeys(depth.frame or cameras[0].frame for depth in depths):
-            notes += _check_way(tree, path, frame, options.world)
-    poses = None if tree is None or options.world is None else (tree, options.world)
+            notes += _check_way(path, frame, *poses)
     return make_video(path, depths, colours, cameras, poses, config, notes)
 
 
-def _check_way(tree: TransformTree, path: Path, frame: str, world: str) -> list[str]:
+def _check_way(path: Path, frame: str, tree: TransformTree, world: str) -> list[str]:
     """Check that transforms connect a camera's frame with the world, and list the parents that do not."""
     if not tree.frames:
         raise InputError(path, "has no transforms", "record /tf and /tf_static, or omit --tf")

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-import struct
 import warnings
 import zipfile
-import zlib
 from collections.abc import Collection, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -25,17 +23,6 @@ MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
 """Pillow modes of depth images, and of masks."""
 MAX_PIXELS: Final = RecordingConfig().max_pixels
 """Default of the maximum number of pixels."""
-_BAD_BYTES: Final = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    TypeError,
-    EOFError,
-    IndexError,
-    struct.error,
-    zlib.error,
-)
-"""Exceptions of Pillow for a broken image."""
 
 
 class BrokenImageError(InputError):
@@ -103,7 +90,9 @@ def decode_image(
         raise BrokenImageError(source, reason, "give a smaller image") from None
     except UnidentifiedImageError as error:
         raise BrokenImageError(source, "not an image", remedy) from error
-    except _BAD_BYTES as error:
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # Pillow raises almost anything for a broken image
         raise BrokenImageError(source, f"the image is truncated or broken ({error})", remedy) from error
 
 

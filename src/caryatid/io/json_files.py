@@ -165,9 +165,5 @@ def _sentence(error: Any) -> str:
     message = str(error.get("ctx", {}).get("error") or error["msg"])
     message = message.replace("Input should be", "must be")
     message = message.replace("a dictionary or an instance of", "the object")
-    return f"{where}'{last}' is {_shown(error['input'])}: {message}"
-
-
-def _shown(value: Any) -> str:
-    text = json.dumps(value, ensure_ascii=False, default=str)
-    return text if len(text) <= 40 else text[:37] + "…"
+    given = json.dumps(error["input"], ensure_ascii=False, default=str)
+    return f"{where}'{last}' is {given if len(given) <= 40 else given[:37] + '…'}: {message}"

@@ -29,7 +29,7 @@ from caryatid.io.datasets import Dataset, Frame, OpenOptions
 from caryatid.io.images import BrokenImageError
 from caryatid.io.json_files import Numbers, parse_json, read_json
 from caryatid.io.staging import read_errors
-from caryatid.io.video import SECOND, is_pose
+from caryatid.io.video import LATEST, SECOND, is_pose
 from caryatid.segmentation.diagnosis import GL, Y_UP
 from caryatid.sensing.views import View, check_intrinsics
 
@@ -39,8 +39,6 @@ PINHOLES: Final = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPEN
 """Camera models of nerfstudio that are pinholes where the images are not distorted."""
 AGAIN: Final = "export the recording again"
 """Remedy for broken files."""
-LATEST: Final = 2**32
-"""Upper limit of times [s]: in nanoseconds, they fit in 64 bits."""
 
 
 def recognises(path: Path) -> bool:

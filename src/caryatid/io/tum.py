@@ -20,7 +20,7 @@ from caryatid.errors import InputError
 from caryatid.io import images
 from caryatid.io.datasets import Dataset, OpenOptions
 from caryatid.io.json_files import parse_json, read_json
-from caryatid.io.video import SECOND, TimedCamera, TimedImage, TransformTree, is_pose, make_video
+from caryatid.io.video import LATEST, SECOND, TimedCamera, TimedImage, TransformTree, is_pose, make_video
 from caryatid.sensing.views import check_intrinsics
 
 PUBLISHED: Final[Mapping[str, tuple[float, float, float, float]]] = {
@@ -30,8 +30,6 @@ PUBLISHED: Final[Mapping[str, tuple[float, float, float, float]]] = {
 }
 """Published fx, fy, cx, cy [px] of the data set's three cameras of 640×480 pixels."""
 _WORLD, _CAMERA = "world", "camera"
-_LATEST: Final = 2**32
-"""Upper limit of times [s], in 2106: in nanoseconds, they and their differences fit in 64 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +115,7 @@ def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
     for words in rows[1:] if rows and re.search("time|stamp", rows[0][0].lower()) else rows:
         try:
             time = Decimal(words[0])
-            valid = abs(time) < _LATEST
+            valid = abs(time) < LATEST
         except ArithmeticError:
             valid = False
         if not valid:

@@ -27,6 +27,8 @@ from caryatid.sensing.views import View
 
 SECOND = 1_000_000_000
 """Nanoseconds per second: times are whole nanoseconds since 1970, which floats cannot hold."""
+LATEST: Final = 2**32
+"""Upper limit of times [s], in 2106: in nanoseconds, they and their differences fit in 64 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,11 +165,12 @@ def _described(size: tuple[int, ...], frame: str) -> str:
 class _Link:
     """Poses of one frame in another over time: times [ns], and translations with quaternions, w last.
 
-    Compact, because robots may record for hours.
+    Compact, because robots may record for hours. Without any, a fixed pose (4, 4) holds at all times.
     """
 
     times: array[int] = field(default_factory=lambda: array("q"))
     numbers: array[float] = field(default_factory=lambda: array("d"))
+    fixed: Array | None = None
 
     @cached_property
     def in_order(self) -> tuple[NDArray[np.int64], Array]:
@@ -189,15 +192,13 @@ class TransformTree:
     def __init__(self, max_gap: float, name: str = "transforms") -> None:
         self._name = name
         self._max_gap = round(max_gap * SECOND)
-        self._fixed: defaultdict[str, dict[str, Array]] = defaultdict(dict)
-        self._links: defaultdict[str, dict[str, _Link]] = defaultdict(dict)
+        self._links: defaultdict[str, defaultdict[str, _Link]] = defaultdict(lambda: defaultdict(_Link))
         self.moved: dict[str, str] = {}
 
     @property
     def frames(self) -> list[str]:
         """Names of all frames."""
-        children = {*self._links, *self._fixed}
-        return sorted(children.union(*map(self.parents, children)))
+        return sorted({*self._links}.union(*self._links.values()))
 
     def times(self, frame: str) -> list[int]:
         """All times [ns] of the poses of a frame; none if it is fixed."""
@@ -209,20 +210,19 @@ class TransformTree:
         A pose fulfils `is_pose`; of two at the same time, the later one counts. A fixed one holds at all
         times, unless there are poses with times.
         """
+        link = self._links[child][parent]
         if fixed:
-            rotation = Rotation.from_quat(pose[3:]).as_matrix()
-            T_parent_child = transforms.rigid(rotation, pose[:3])
-            if not np.allclose(T_parent_child, self._fixed[child].get(parent, T_parent_child), atol=1e-3):
+            T_parent_child = transforms.rigid(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
+            if link.fixed is not None and not np.allclose(T_parent_child, link.fixed, atol=1e-3):
                 self.moved[child] = parent
-            self._fixed[child][parent] = T_parent_child
-            return
-        link = self._links[child].setdefault(parent, _Link())
-        link.times.append(time)
-        link.numbers.extend(pose)
+            link.fixed = T_parent_child
+        else:
+            link.times.append(time)
+            link.numbers.extend(pose)
 
     def parents(self, frame: str) -> list[str]:
         """All parents of a frame, by name."""
-        return sorted({*self._links.get(frame, ()), *self._fixed.get(frame, ())})
+        return sorted(self._links.get(frame, ()))
 
     def ancestors(self, frame: str) -> list[str]:
         """The frame, its parents, their parents and so on, at any time."""
@@ -269,9 +269,10 @@ class TransformTree:
 
     def _step(self, child: str, parent: str, time: int) -> Array | None:
         """The pose of a frame in its parent at a time, or None if unknown."""
-        if parent not in self._links.get(child, ()):
-            return self._fixed[child][parent]
-        times, poses = self._links[child][parent].in_order
+        link = self._links[child][parent]
+        if not link.times:
+            return link.fixed
+        times, poses = link.in_order
         stop = int(np.searchsorted(times, time))
         if stop == len(times):
             return None
