@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from typing import Final, NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
@@ -340,11 +341,8 @@ def _top_of(shape: Shape) -> TrueSurface:
 
 def _top_overlap(a: TrueSurface, b: TrueSurface) -> float:
     """IoU of two tops, seen from above [1]."""
-    low = max(a.x - a.half_x, b.x - b.half_x), max(a.y - a.half_y, b.y - b.half_y)
-    high = min(a.x + a.half_x, b.x + b.half_x), min(a.y + a.half_y, b.y + b.half_y)
-    common = max(high[0] - low[0], 0.0) * max(high[1] - low[1], 0.0)
-    areas = 4.0 * (a.half_x * a.half_y + b.half_x * b.half_y)
-    return common / (areas - common) if common else 0.0
+    one, other = (shapely.box(t.x - t.half_x, t.y - t.half_y, t.x + t.half_x, t.y + t.half_y) for t in (a, b))
+    return float(one.intersection(other).area / one.union(other).area)
 
 
 def _ratios(right: int, claimed: int, true: int) -> tuple[float, float]:
