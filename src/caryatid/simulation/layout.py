@@ -114,7 +114,12 @@ def _compute(model: Any, data: Any, source: str) -> None:
 
 def _find_trees(model: Any, data: Any) -> list[_Tree]:
     """All that moves, in a state at which no two hinges of a body are parallel."""
-    driven = _driven_dofs(model, data)
+    # Degrees of freedom that actuators move, directly, by tendons or at sites; adhesion moves nothing.
+    driven = {
+        int(data.moment_colind[data.moment_rowadr[k] + j])
+        for k in np.flatnonzero(model.actuator_trntype != mujoco.mjtTrn.mjTRN_BODY)
+        for j in range(data.moment_rownnz[k])
+    }
     collides = model.geom_contype | model.geom_conaffinity
     trees = []
     for tree in range(model.ntree):
@@ -151,15 +156,6 @@ def unknown_keyframe(source: str, wanted: str, names: list[str]) -> InputError:
     """The error that a scene has no keyframe of this name or number."""
     remedy = f"its keyframes: {', '.join(names)}" if names else "it has none: omit --keyframe"
     return InputError(source, f"has no keyframe '{wanted}'", remedy)
-
-
-def _driven_dofs(model: Any, data: Any) -> set[int]:
-    """Degrees of freedom that actuators move, directly, by tendons or at sites; adhesion moves nothing."""
-    return {
-        int(data.moment_colind[data.moment_rowadr[k] + j])
-        for k in np.flatnonzero(model.actuator_trntype != mujoco.mjtTrn.mjTRN_BODY)
-        for j in range(data.moment_rownnz[k])
-    }
 
 
 def _place(body: Any, number: int, model: Any, data: Any) -> None:

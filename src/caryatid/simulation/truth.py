@@ -17,9 +17,10 @@ from caryatid.io.staging import write_file
 from caryatid.runtime.parallel import on_threads
 from caryatid.simulation.world import (
     SimulatedScene,
-    body_poses,
     held_from_below,
     mean_contact_forces,
+    pose_addresses,
+    poses_of,
     state_of,
     strayed,
 )
@@ -97,18 +98,14 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
 
 def displaced_without(scene: SimulatedScene, label: int, config: PhysicsConfig) -> set[int]:
     """Labels of the objects that have moved beyond the limits some time after a removal."""
-    data = state_of(scene)
-    joint = int(scene.model.body_jntadr[scene.body_id(label)])
+    data, labels = state_of(scene), list(scene.object_bodies)
+    places, before = pose_addresses(scene), poses_of(scene)
     # 100 m up, it falls 5 m in the second in which the others are observed.
-    data.qpos[int(scene.model.jnt_qposadr[joint]) + 2] += 100.0
+    data.qpos[places[labels.index(label), 2]] += 100.0
     mujoco.mj_forward(scene.model, data)
-    others = [other for other in scene.object_bodies if other != label]
-    bodies = [scene.body_id(other) for other in others]
-    before = body_poses(data)[bodies]
     mujoco.mj_step(scene.model, data, nstep=max(1, round(config.removal_time / scene.model.opt.timestep)))
-    mujoco.mj_kinematics(scene.model, data)
-    moved = strayed(before, body_poses(data)[bodies], config.moved, config.turned)
-    return {other for other, far in zip(others, moved, strict=True) if far}
+    moved = strayed(before, data.qpos[places], config.moved, config.turned)
+    return {other for other, far in zip(labels, moved, strict=True) if far and other != label}
 
 
 def read_truth(path: Path) -> GroundTruth:

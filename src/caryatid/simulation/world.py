@@ -542,29 +542,26 @@ def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
 
 def table_centre(scene: SimulatedScene) -> Array:
     """Middle (3,) [m] of the main surface's top, world frame; on the ground, the middle of the objects."""
-    centre, _ = _top_face(scene, scene.table)
-    if centre[2] <= STEP:
-        centre[:2] = np.median([shape.T_world_object[:2, 3] for shape in true_shapes(scene).values()], axis=0)
-    return centre
+    height, x, y, _, _ = surface_of(scene, scene.table)
+    if height <= STEP:
+        x, y = np.median([shape.T_world_object[:2, 3] for shape in true_shapes(scene).values()], axis=0)
+    return np.array([x, y, height])
 
 
 def surface_of(scene: SimulatedScene, name: str) -> tuple[float, float, float, float, float]:
-    """Height of a surface's top, x and y of its middle, and half its sizes along x and y [m]."""
-    (x, y, height), (half_x, half_y) = (part.tolist() for part in _top_face(scene, name))
-    return height, x, y, half_x, half_y
+    """Height of a surface's top, x and y of its middle, and half its sizes along x and y [m].
 
-
-def _top_face(scene: SimulatedScene, name: str) -> tuple[Array, Array]:
-    """Middle (3,) and half sizes along x and y (2,) [m] of the largest upper face of a surface."""
+    The top is its largest upper face.
+    """
     faces = []
     for box in (_geom_box(scene, g) for g in scene.surfaces[name]):
         R, half = box.T_world_object[:3, :3], box.extents / 2.0
         up = int(np.argmax(np.abs(R[2])))
         area = float(abs(R[2, up]) * np.prod(np.delete(half, up)))
-        centre = box.T_world_object[:3, 3] + np.copysign(half[up], R[2, up]) * R[:, up]
-        faces.append((area, centre, np.abs(R[:2]) @ np.where(np.arange(3) == up, 0.0, half)))
-    _, centre, sizes = max(faces, key=lambda face: face[0])
-    return centre, sizes
+        x, y, height = (box.T_world_object[:3, 3] + np.copysign(half[up], R[2, up]) * R[:, up]).tolist()
+        half_x, half_y = (np.abs(R[:2]) @ np.where(np.arange(3) == up, 0.0, half)).tolist()
+        faces.append((area, (height, x, y, half_x, half_y)))
+    return max(faces, key=lambda face: face[0])[1]
 
 
 def _solid_geoms(scene: SimulatedScene, label: int) -> list[int]:
