@@ -145,11 +145,9 @@ class OnnxMasks:
         masks = masks.reshape(-1, *masks.shape[-2:]) if masks.ndim > 3 else masks
         if masks.dtype != np.bool_ and masks.size and masks.min() < 0.0:
             masks = masks > 0.0
-        if masks.ndim == 3 and len(masks) == 0:
-            labels = np.zeros(view.depth.shape, dtype=np.int32)
-            return replace(view, labels=labels, labels_are="segments", names=None)
         if masks.ndim == 3 and masks.shape[1:] != view.depth.shape:
-            masks = np.stack([mask[_pixels(view.depth.shape, mask.shape)] for mask in masks])
+            rows, columns = _pixels(view.depth.shape, masks.shape[1:])
+            masks = masks[:, rows, columns]
         scores = np.asarray(results[1]).ravel() if len(results) > 1 else None
         return replace(view, labels=labels_from_masks(masks, scores), labels_are="segments", names=None)
 
