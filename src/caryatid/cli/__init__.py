@@ -77,17 +77,6 @@ def _interrupt_again(lost: sys.UnraisableHookArgs) -> None:
         sys.__unraisablehook__(lost)
 
 
-def _catch_signals() -> None:
-    """Make SIGTERM, SIGHUP and repeated interrupts raise KeyboardInterrupt."""
-    if not hasattr(signal, "SIGALRM"):
-        sys.exit("error: caryatid: this system has no POSIX signals; on Windows, run it in WSL")
-    signal.signal(signal.SIGALRM, signal.default_int_handler)
-    sys.unraisablehook = _interrupt_again
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, signal.default_int_handler)
-
-
 def run_from_shell() -> NoReturn:
     """Run the command line and exit with its status.
 
@@ -97,8 +86,14 @@ def run_from_shell() -> NoReturn:
         stream = getattr(sys, name) or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
         stream.reconfigure(errors="backslashreplace")  # JSON and TOML read these escapes
         setattr(sys, name, stream)
+    if not hasattr(signal, "SIGALRM"):
+        sys.exit("error: caryatid: this system has no POSIX signals; on Windows, run it in WSL")
     try:
-        _catch_signals()
+        signal.signal(signal.SIGALRM, signal.default_int_handler)
+        sys.unraisablehook = _interrupt_again
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, signal.default_int_handler)
         status = main()
     except KeyboardInterrupt:  # before `main` began or after it ended
         sys.stderr.write("interrupted: nothing was written\n")

@@ -18,7 +18,6 @@ from typing import (
     Any,
     ClassVar,
     Literal,
-    TypedDict,
     TypeVar,
     Union,
     dataclass_transform,
@@ -50,11 +49,11 @@ def shown(metavar: str | None = None, default: object = "") -> object:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})" if default else "")
 
 
-def default_of(setting: str, metavar: str | None = None) -> object:
+def default_of(setting: str) -> object:
     """An option for a setting, such as `active.max_views`, that shows the default of the setting."""
     from caryatid.config import Config
 
-    return shown(metavar, attrgetter(setting)(Config()))
+    return shown(default=attrgetter(setting)(Config()))
 
 
 def planner_name() -> Any:
@@ -238,13 +237,6 @@ class ComputingCommand(Command):
             os.environ["CARYATID_THREADS"] = str(self.threads)
 
 
-class Looking(TypedDict):
-    """Options that every processing of views takes."""
-
-    segmentation: SegmentationMethod | None
-    seed: int
-
-
 class LookingCommand(ComputingCommand):
     """A command that processes views."""
 
@@ -255,7 +247,7 @@ class LookingCommand(ComputingCommand):
     """Pixels to ignore, such as the robot's arm: a grey PNG, 0 = keep; or a folder, one NAME.png per view."""
 
     @property
-    def looking(self) -> Looking:
+    def looking(self) -> dict[str, Any]:
         """The options that every processing of views takes."""
         return {"segmentation": self.segmentation, "seed": self.settings.seed}
 

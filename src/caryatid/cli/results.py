@@ -46,10 +46,10 @@ def check_views(command: Check) -> int:
     with command.output.working("looking"):
         dataset = levelled(dataset, config) if command.level else dataset
         found = diagnose(dataset, config)
-    columns = {
-        "view": "view", "size": "size\n[px]", "field_of_view": "width\n[°]", "readings": "readings",
-        "near": "near\n[m]", "far": "far\n[m]", "plane": "largest\nplane", "tilt": "tilt\n[°]",
-    }  # fmt: skip
+    columns = (
+        "view", "size\n[px]", "width\n[°]", "readings", "near\n[m]", "far\n[m]", "largest\nplane",
+        "tilt\n[°]",
+    )  # fmt: skip
     rows = []
     for view in found.views:
         tilt = "–" if view["tilt"] is None else f"{view['tilt']:.1f}"
@@ -67,12 +67,12 @@ def check_views(command: Check) -> int:
             "cam_t_w2c [mm] are the inverse of T_world_camera.\n"
         )
     said += "" if said else "nothing is wrong\n"
-    shown = table(f"{source}: {count_of(len(rows), 'view')}", [*columns.values()], rows, figures=True)
+    shown = table(f"{source}: {count_of(len(rows), 'view')}", columns, rows, figures=True)
     if command.report is not None:
         known = {view["view"] for view in found.views}
         frames = [frame for frame in dataset.frames if frame.name in known]
         views = [frame.load() for frame in frames[:: -(-len(frames) // SHOWN) or 1]]
-        numbers = Table.of("Views", (name.replace("\n", " ") for name in columns.values()), rows)
+        numbers = Table.of("Views", (name.replace("\n", " ") for name in columns), rows)
         page = make_check_report(source.name, found, views, numbers, config.cloud)
         write_file(command.report, render_html(page).encode())
     command.output.result(

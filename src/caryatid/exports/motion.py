@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Cylinder, Primitives, Shape, Sphere
 from caryatid.geometry.solids import Solid
-from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.io.json_files import json_text
 from caryatid.sensing.voxel_map import UNKNOWN, VoxelMap
@@ -66,10 +65,12 @@ def planning_scene(
 
 def collision_object(item: SceneObject, frame: str) -> dict[str, Any]:
     """A moveit_msgs/CollisionObject that adds an object."""
+    T = item.shape.T_world_object
+    *xyz, w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist()
     return {
         "header": {"frame_id": frame},
         "id": item.id,
-        "pose": _pose_message(item.shape.T_world_object),
+        "pose": {"position": _xyz(*T[:3, 3].tolist()), "orientation": _xyz(*xyz) | {"w": w}},
         **_geometry(item.shape),
         "operation": ADD,
     }
@@ -162,12 +163,6 @@ def _geometry(shape: Shape) -> dict[str, Any]:
         case _:
             primitive = {"type": BOX, "dimensions": shape.extents.tolist()}
     return {"primitives": [primitive], "primitive_poses": [HERE]}
-
-
-def _pose_message(T: Array) -> dict[str, Any]:
-    """A geometry_msgs/Pose."""
-    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist()
-    return {"position": _xyz(*T[:3, 3].tolist()), "orientation": _xyz(x, y, z) | {"w": w}}
 
 
 def _xyz(x: float, y: float, z: float) -> dict[str, float]:
