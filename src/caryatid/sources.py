@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import NoneType
@@ -21,15 +22,7 @@ from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
 from caryatid.graph import SupportGraph
 from caryatid.io.cloud_frames import level_cloud
-from caryatid.io.datasets import (
-    Dataset,
-    Frame,
-    OpenOptions,
-    find_sample,
-    format_of,
-    join_datasets,
-    open_dataset,
-)
+from caryatid.io.datasets import Dataset, OpenOptions, find_sample, format_of, join_datasets, open_dataset
 from caryatid.io.graph_json import read_graph
 from caryatid.io.importing import choose_frames, levelled
 from caryatid.io.mask_sources import MaskSource, without_ignored
@@ -246,8 +239,8 @@ def open_recording(
     opened = [open_dataset(f, config.recording, OpenOptions(masks=use_masks)) for f in (folder, *more)]
     recording = join_datasets([choose_frames(d, config.recording) if d.is_video else d for d in opened])
     if ignore is not None:
-        frames = [_ignoring(f, ignore, config.recording.max_pixels) for f in recording.frames]
-        recording = replace(recording, frames=frames)
+        drop = partial(without_ignored, ignore=ignore, max_pixels=config.recording.max_pixels)
+        recording = replace(recording, frames=[frame.changed(drop) for frame in recording.frames])
     if level:
         recording = levelled(recording, config)
     for note in recording.notes:
@@ -323,11 +316,6 @@ def _viewable(source: str) -> Kind:
         hint = "%s: using the one that comes with caryatid; for the file or folder here, write ./%s"
         log.info(hint, source, source)
     return kind
-
-
-def _ignoring(frame: Frame, ignore: Path, max_pixels: int) -> Frame:
-    """A frame whose view lacks the pixels to ignore."""
-    return replace(frame, load=lambda: without_ignored(frame.load(), ignore, max_pixels))
 
 
 def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:

@@ -68,6 +68,10 @@ class Frame:
     time: int = 0
     has_labels: bool = False
 
+    def changed(self, change: Callable[[View], View], **fields: Any) -> Frame:
+        """Return a frame with other fields, whose view is changed by a function when it is loaded."""
+        return replace(self, load=lambda: change(self.load()), **fields)
+
     def load_labels(self) -> NDArray[np.int32]:
         """Decode it for its labels (H, W) alone.
 
@@ -149,7 +153,7 @@ def join_datasets(datasets: Sequence[Dataset]) -> Dataset:
 
     def renumbered(number: int, frame: Frame) -> Frame:
         name = f"{title}/{number:06d}"
-        return replace(frame, name=name, number=number, load=lambda: replace(frame.load(), name=name))
+        return frame.changed(lambda view: replace(view, name=name), name=name, number=number)
 
     skipped = sum((Counter(dataset.skipped) for dataset in datasets), Counter[str]())
     notes = tuple(dict.fromkeys(note for dataset in datasets for note in dataset.notes))
@@ -203,18 +207,14 @@ def open_dataset(
     dataset = known.open_dataset(path, config, options or OpenOptions())
     if (config.axes, config.depth) == ("optical", "axis"):
         return dataset
-    return replace(dataset, frames=[_converted(frame, config) for frame in dataset.frames])
-
-
-def _converted(frame: Frame, config: RecordingConfig) -> Frame:
-    """A frame whose camera axes and depth are ours, from one of another convention."""
     axes = {"optical": np.eye(4), "opengl": GL, "body": BODY}[config.axes]
-    T = None if frame.T_world_camera is None else frame.T_world_camera @ axes
 
-    def load() -> View:
-        view = frame.load()
+    def convert(view: View) -> View:
+        """Give a view of another convention our camera axes and depth."""
         if config.depth == "ray":
             view = replace(view, depth=(view.depth / ray_lengths(view)).astype(np.float32))
-        return replace(view, T_world_camera=T)
+        return view if view.T_world_camera is None else view.with_pose(view.T_world_camera @ axes)
 
-    return replace(frame, load=load, T_world_camera=T)
+    poses = [None if (T := f.T_world_camera) is None else T @ axes for f in dataset.frames]
+    frames = [f.changed(convert, T_world_camera=T) for f, T in zip(dataset.frames, poses, strict=True)]
+    return replace(dataset, frames=frames)

@@ -24,7 +24,6 @@ from caryatid.io.staging import StagedFolder
 from caryatid.io.video import SECOND
 from caryatid.segmentation.diagnosis import GL_AXES, check_camera
 from caryatid.segmentation.observation import level_transform
-from caryatid.sensing.views import View
 
 BROKEN: Final = "broken"
 DARK: Final = "too few depth readings"
@@ -86,7 +85,13 @@ def levelled(dataset: Dataset, config: Config) -> Dataset:
     T_level_world = _level_rotation(dataset, config)
     turn = np.rad2deg(transforms.angle_between(T_level_world[2, :3], transforms.UP))
     note = f"world frame rotated by {turn:.1f}° to level the table"
-    frames = [_turned(frame, T_level_world) for frame in dataset.frames]
+    frames = [
+        frame.changed(
+            lambda view: view.with_pose(T_level_world @ view.pose),
+            T_world_camera=None if (T := frame.T_world_camera) is None else T_level_world @ T,
+        )
+        for frame in dataset.frames
+    ]
     return replace(dataset, frames=frames, notes=(*dataset.notes, note))
 
 
@@ -207,17 +212,6 @@ def _level_rotation(dataset: Dataset, config: Config) -> Array:
         raise InputError(dataset.path, reason, remedy)
     turn, _ = Rotation.align_vectors(transforms.UP[None], ups[near].mean(axis=0)[None])
     return transforms.rigid(turn.as_matrix(), np.zeros(3))
-
-
-def _turned(frame: Frame, T: Array) -> Frame:
-    """The frame, moved by a rigid transform (4, 4) of the world."""
-
-    def load() -> View:
-        view = frame.load()
-        return view.with_pose(T @ view.pose)
-
-    assert frame.T_world_camera is not None
-    return replace(frame, load=load, T_world_camera=T @ frame.T_world_camera)
 
 
 def _apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig) -> Array:
