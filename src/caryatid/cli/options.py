@@ -143,9 +143,8 @@ class Settings:
     def read(
         self,
         options: Mapping[str, object] | None = None,
-        base: Config | None = None,
-        *,
         named: Mapping[str, object] | None = None,
+        base: Config | None = None,
     ) -> Config:
         """The configuration: options (name of a setting → value, or None) > --set > named > file > base."""
         from caryatid.config.settings import read_settings
@@ -176,9 +175,9 @@ class Modelling(Settings):
     def read(
         self,
         options: Mapping[str, object] | None = None,
+        named: Mapping[str, object] | None = None,
         base: Config | None = None,
         *,
-        named: Mapping[str, object] | None = None,
         takes_views: bool = False,
     ) -> Config:
         """The configuration, as `Settings.read` returns it, with the options here.
@@ -191,10 +190,9 @@ class Modelling(Settings):
         if self.masks_from is not None and not takes_views:
             reason = "this command takes only scene or per-view, because it reads no views"
             raise InputError(f"--masks {self.masks}", reason, "use it with explore, extract, clear or view")
-        base = base or preset(self.preset)
         identity = None if self.masks_from else self.masks
         given = {"fusion.method": self.fusion, "fusion.masks": identity, **(options or {})}
-        return super().read(given, base, named=named)
+        return super().read(given, named, base or preset(self.preset))
 
     @property
     def masks_from(self) -> str | None:
@@ -303,7 +301,7 @@ class ExploringCommand(PlanningCommand):
     ) -> Config:
         """All settings; options and named ones as for `Settings.read`."""
         given = {"active.max_views": self.views, **(options or {})}
-        return self.settings.read(given, named=named, takes_views=True)
+        return self.settings.read(given, named, takes_views=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -321,21 +319,16 @@ class LiftingCommand:
     risk: Annotated[Probability | None, default_of("rehearsal.risk")] = None
     """Maximum probability that a lift moves another object."""
 
-    def lift_settings(self) -> dict[str, object]:
-        """Settings that have an option here, with its value, or None if omitted."""
+    def lift_settings(self) -> tuple[dict[str, object], dict[str, object]]:
+        """Settings that have an option here, or None if omitted; and those of a gripper known by name."""
         from caryatid.config import GRIPPERS
 
-        kind = GRIPPERS[self.gripper].kind if self.gripper in GRIPPERS else self.gripper
-        return {"rehearsal.risk": self.risk, "gripper.kind": kind}
-
-    def gripper_settings(self) -> dict[str, object]:
-        """Settings of a gripper that is known by name."""
-        from caryatid.config import GRIPPERS
-
+        given: dict[str, object] = {"rehearsal.risk": self.risk, "gripper.kind": self.gripper}
         if (known := GRIPPERS.get(self.gripper or "")) is None:
-            return {}
+            return given, {}
         names = ("opening", "finger", "length", "hand", "breadth", "turn")
-        return {f"gripper.{name}": getattr(known, name) for name in names}
+        named = {f"gripper.{name}": getattr(known, name) for name in names}
+        return given | {"gripper.kind": known.kind}, named
 
     def reachable(self, config: Config) -> ReachabilityMap | None:
         """Which gripper poses the arm reaches; None = all.

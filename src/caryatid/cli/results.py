@@ -134,7 +134,7 @@ def print_scores(command: Evaluate) -> None:
 
 
 def find_order(command: Order) -> int:
-    config = command.settings.read(command.lift_settings(), named=command.gripper_settings())
+    config = command.settings.read(*command.lift_settings())
     graph, voxels = read_model(command.run)
     reachable, seed = command.reachable(config), command.settings.seed
     with command.output.working("rehearsing"):

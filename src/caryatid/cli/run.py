@@ -122,7 +122,7 @@ def _open_loop(command: View, config: Config) -> Page:
 
 
 def clear_table(command: Clear) -> int:
-    config, output = command.config(command.lift_settings(), command.gripper_settings()), command.output
+    config, output = command.config(*command.lift_settings()), command.output
     reachable = command.reachable(config)
     source, masks = _open(command, config)
     camera = source.camera
