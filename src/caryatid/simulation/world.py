@@ -69,10 +69,6 @@ class SimulatedScene:
         """MuJoCo's number of the body of the object with this label."""
         return int(self.model.body(self.object_bodies[label]).id)
 
-    def geoms(self, label: int) -> list[int]:
-        """Geoms of the object with this label, or of the main surface with 0, with bodies welded to it."""
-        return np.flatnonzero(self.geom_labels == label).tolist() if label else self.surfaces[self.table]
-
 
 def scene_from_spec(
     spec: Any, name: str, source: str, config: PhysicsConfig | None = None, *, least: float = 0.0
@@ -536,7 +532,8 @@ def true_shapes(scene: SimulatedScene) -> dict[int, Shape]:
 def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
     """Oriented boxes around all geoms that belong to no object, the table's first; planes are left out."""
     flat = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
-    geoms = dict.fromkeys([*scene.geoms(0), *np.flatnonzero(scene.geom_labels <= 0).tolist()])
+    static = np.flatnonzero(scene.geom_labels <= 0).tolist()
+    geoms = dict.fromkeys([*scene.surfaces[scene.table], *static])
     return tuple(_geom_box(scene, g) for g in geoms if int(scene.model.geom_type[g]) not in flat)
 
 
@@ -566,7 +563,7 @@ def surface_of(scene: SimulatedScene, name: str) -> tuple[float, float, float, f
 
 def _solid_geoms(scene: SimulatedScene, label: int) -> list[int]:
     """Geoms that make up the solid of an object: those that collide, or all if none does."""
-    geoms, model = scene.geoms(label), scene.model
+    geoms, model = np.flatnonzero(scene.geom_labels == label).tolist(), scene.model
     return [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]] or geoms
 
 
