@@ -32,6 +32,7 @@ from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.robots import Posture
+from caryatid.runtime import LIBRARIES
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.support.relations import Effect, Removal
@@ -39,8 +40,6 @@ from caryatid.support.relations import Effect, Removal
 FORMAT: Final = "caryatid/run"
 AGAIN: Final = "run caryatid again"
 """Remedy for a broken file of a run."""
-PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
-"""Packages whose versions run.json records."""
 OWN_FILES: Final = re.compile(
     r"(run|graph)\.json|report\.html|lifts/\d+\.png|views/\d+/(graph\.json|view\.json|labels\.(png|npy)|step\.npz)"
 )
@@ -151,7 +150,8 @@ class RunWriter(StagedFolder):
         """Write the files of the whole run, run.json last, and publish the folder."""
         document = {"format": FORMAT, "version": 2, "views": len(self.steps)} | self._about
         document["date"] = self._date
-        document["versions"] = {"python": platform.python_version()} | {p: version(p) for p in PACKAGES}
+        packages = {name: version(name) for name in ("caryatid", *LIBRARIES)}
+        document["versions"] = {"python": platform.python_version()} | packages
         document |= {name: self.steps[-1][name] for name in ("angle_travelled", "path_travelled")}
         document["steps"] = self.steps
         document |= ({"scores": self._scores} if self._scores else {}) | self.more | more

@@ -128,12 +128,6 @@ class _NerfFrame:
     depth_file_path: str | None = None
     depth_unit_scale_factor: Annotated[float, Gt(0), Le(1)] = 0.001
     camera_model: str = "PINHOLE"
-    k1: float = 0.0
-    k2: float = 0.0
-    k3: float = 0.0
-    k4: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
 
 
 def _read_nerfstudio(path: Path, max_pixels: int) -> Iterator[_Shot]:
@@ -152,7 +146,7 @@ def _read_nerfstudio(path: Path, max_pixels: int) -> Iterator[_Shot]:
             raise InputError(
                 where, f"its camera is {known.camera_model}, not a pinhole", "undistort its images"
             )
-        if any((known.k1, known.k2, known.k3, known.k4, known.p1, known.p2)):
+        if any((document | frame).get(name) for name in ("k1", "k2", "k3", "k4", "p1", "p2")):
             raise InputError(where, "its images are distorted (k1, k2, …)", "undistort them and depth first")
         K = np.array([[known.fl_x, 0.0, known.cx], [0.0, known.fl_y, known.cy], [0.0, 0.0, 1.0]])
         unit = 1000.0 * known.depth_unit_scale_factor
