@@ -25,9 +25,7 @@ GRAZING = float(np.cos(np.radians(80.0)))
 """Cosine of the angle of incidence beyond which a sensor reads no surface [1]: such a reading mixes two."""
 
 
-def oriented_points(
-    view: View, config: CloudConfig, *, among: NDArray[np.bool_] | None = None
-) -> tuple[Array, Array, NDArray[np.intp]]:
+def oriented_points(view: View, config: CloudConfig) -> tuple[Array, Array, NDArray[np.intp]]:
     """Oriented points of a view: the readings in working range that have a normal, smoothed by local planes.
 
     A view with normals of its own (`view.normals_camera`) is taken as exact.
@@ -35,7 +33,6 @@ def oriented_points(
     Args:
         view: The view; without a pose, "world" below is the camera frame.
         config: Working range and normal estimation.
-        among: Which readings (H, W) to take, or None for all of them.
 
     Returns:
         Points (N, 3) [m] and unit normals (N, 3) in the world frame, and the flat pixel index (N,) of each.
@@ -45,7 +42,7 @@ def oriented_points(
     given = view.normals_camera
     if given is not None:
         taken &= np.einsum("hwi,hwi->hw", given, given) > 0.5
-        pixels = np.flatnonzero(taken if among is None else taken & among)
+        pixels = np.flatnonzero(taken)
         points = transforms.transform(T, view.points_camera.reshape(-1, 3)[pixels])
         return points, transforms.rotate(T, given.reshape(-1, 3)[pixels].astype(float)), pixels
     inverse_depth = np.divide(np.float32(1.0), view.depth, out=np.zeros_like(view.depth), where=taken)
@@ -53,8 +50,6 @@ def oriented_points(
     if distance := working_distance(view, config):
         width = config.normal_size * view.K[0, 0] / distance
         radius = min(radius, max(1, round((width - 1.0) / 2.0)))
-    if among is not None:
-        inverse_depth[~among] = 0.0
     planes = local_planes(inverse_depth, radius, config.edge_jump, slope_limit(view.K[0, 0], config))
     pixels = np.flatnonzero(planes[2] > 0.0)
     points, normals = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
