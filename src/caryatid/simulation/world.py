@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import mujoco
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -160,14 +161,9 @@ def _static_geoms(model: Any) -> dict[str, list[int]]:
 
 def _with_main_surface(scene: SimulatedScene, share: float) -> SimulatedScene:
     """Put first the surface that most objects stand on, directly or not; of several, the first."""
-    held = held_from_below(scene, mean_contact_forces(scene), share)
-    counts = []
-    for surface in range(len(scene.surfaces)):
-        above, new = set[int](), {-surface}
-        while new:
-            new = {b for a, b in held if a in new} - above
-            above |= new
-        counts.append(len(above))
+    held = nx.DiGraph(held_from_below(scene, mean_contact_forces(scene), share))
+    held.add_nodes_from(-surface for surface in range(len(scene.surfaces)))
+    counts = [len(nx.descendants(held, -surface)) for surface in range(len(scene.surfaces))]
     if not any(counts):
         reason = "nothing static carries an object when the scene is at rest"
         raise InputError(scene.source, reason, "put the objects on a static body or geom, such as a floor")
