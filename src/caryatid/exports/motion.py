@@ -88,10 +88,8 @@ def _unseen_space(graph: SupportGraph, voxels: VoxelMap, frame: str) -> list[dic
     index = np.argwhere(space.states == UNKNOWN)
     points, kept = space.centres_world(index), np.zeros(len(index), dtype=np.bool_)
     for shape in surfaces:
-        local, half = (
-            transforms.transform(transforms.invert(shape.T_world_object), points),
-            shape.extents / 2.0,
-        )
+        local = transforms.transform(transforms.invert(shape.T_world_object), points)
+        half = shape.extents / 2.0
         over = (np.abs(local[:, :2]) < half[:2]).all(axis=1)
         kept |= over & (local[:, 2] > half[2] + voxels.config.size)
     for shape in bodies:
