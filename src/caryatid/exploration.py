@@ -227,8 +227,7 @@ class Explorer:
         self._aside = []
         budget = None if self.step is None else self._budget
         for taken in self.scene.updates(given, budget=budget):
-            self.step = self._step(taken, watch.laps["capture"], kept=taken is not given)
-            yield self.step
+            yield self._step(taken, watch.laps["capture"], kept=taken is not given)
 
     def finish(self) -> list[Step]:
         """Wait until all views are in the model; with a budget, some may be open.
@@ -239,14 +238,10 @@ class Explorer:
         Raises:
             CaryatidError: As for `look`.
         """
-        steps = list[Step]()
-        for taken in self.scene.updates():
-            self.step = self._step(taken, 0.0, kept=True)
-            steps.append(self.step)
-        return steps
+        return [self._step(taken, 0.0, kept=True) for taken in self.scene.updates()]
 
     def _step(self, source: View | Cloud, captured: float, *, kept: bool) -> Step:
-        """The step of the newest view of the scene, with its capture time [s]."""
+        """Make the step of the newest view of the scene, with its capture time [s]."""
         scene, robot, before = self.scene, self.robot, self.step
         assert scene.sphere is not None
         assert scene.labels is not None
@@ -271,12 +266,11 @@ class Explorer:
         if robot is not None and isinstance(posture, Posture):
             footprint = scene.config.robot.footprint
             pose = RobotPose(posture, robot.T_world_camera, footprint, isinstance(robot, ArmRobot))
-        return Step(
+        self.step = Step(
             scene.views - 1, source.name, view, scene.labels, scene.graph, scene.cloud, sphere, visited,
-            None, None, {"capture": captured} | scene.timings, angle, path, None,
-            pose,
-            scene.new_changes,
+            None, None, {"capture": captured} | scene.timings, angle, path, None, pose, scene.new_changes,
         )  # fmt: skip
+        return self.step
 
     def plan(self) -> Step:
         """Choose the next view; if the robot refuses it after a closer check, choose among the others.
