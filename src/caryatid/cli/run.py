@@ -269,8 +269,7 @@ def _about(command: Explore | Extract | Clear) -> dict[str, Any]:
         "robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "budget", "hands",
         "reach", "keyframe",
     )  # fmt: skip
-    known = {field.name: getattr(command, field.name) for field in fields(command)}
-    options = {name: known[name] for name in names if name in known}
+    options = {name: getattr(command, name) for name in names if hasattr(command, name)}
     options |= {"preset": command.settings.preset, "masks": command.settings.masks}
     if not isinstance(command, Extract):
         options["planner"] = command.chosen_planner
