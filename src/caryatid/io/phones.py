@@ -59,13 +59,13 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
         remedy = f"{path} is the recording of a phone; omit them"
         reason = "apply only to bags and TUM folders"
         raise InputError("--depth, --info, --rgb, --tf, --camera", reason, remedy)
-    frames = [frame.decoded_by(path.resolve().name, config) for frame in reader(path, config.max_pixels)]
+    frames = [*reader(path, config)]
     if not frames:
         raise InputError(path, "has no frames with depth", "record depth too, and export it")
     return Dataset(path, sorted(frames, key=attrgetter("time", "number")), is_video=True)
 
 
-def _reader(path: Path) -> Callable[[Path, int], Iterator[_Shot]] | None:
+def _reader(path: Path) -> Callable[[Path, RecordingConfig], Iterator[Frame]] | None:
     if (path / "transforms.json").is_file():
         return _read_nerfstudio
     if (path / "odometry.csv").is_file() and (path / "depth").is_dir():
@@ -78,39 +78,37 @@ def _metadata(path: Path) -> Path:
     return path / ("metadata" if (path / "metadata").is_file() else "metadata.json")
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Shot:
-    """One frame: K (3, 3) is for colour images of a size (width, height) [px], and the world is z up."""
+def _frame(
+    recording: str,
+    far: float,
+    number: int,
+    time: float,
+    T_world_camera: Array,
+    K_colour: Array,
+    size: tuple[int, int],
+    read_depth: Callable[[], NDArray[np.float32]],
+    read_colour: Callable[[], NDArray[np.uint8]],
+) -> Frame:
+    """A frame in a world with z up; K (3, 3) is for colour images of a size (width, height) [px]."""
+    name = f"{recording}/{number:06d}"
 
-    number: int
-    time: float
-    T_world_camera: Array
-    K: Array
-    size: tuple[int, int]
-    depth: Callable[[], NDArray[np.float32]]
-    colour: Callable[[], NDArray[np.uint8]]
-
-    def decoded_by(self, recording: str, config: RecordingConfig) -> Frame:
-        """Make a frame of a dataset."""
-        name = f"{recording}/{self.number:06d}"
-        load = partial(self._load, name, config.far)
-        return Frame(name, self.number, load, self.T_world_camera, round(self.time * SECOND))
-
-    def _load(self, name: str, far: float) -> View:
-        depth, rgb = self.depth(), self.colour()
-        if rgb.shape[1::-1] != self.size:
+    def load() -> View:
+        depth, rgb = read_depth(), read_colour()
+        if rgb.shape[1::-1] != size:
             shown = "×".join(map(str, rgb.shape[1::-1]))
-            reason = f"colour has {shown} pixels, but its camera {self.size[0]}×{self.size[1]}"
+            reason = f"colour has {shown} pixels, but its camera {size[0]}×{size[1]}"
             raise InputError(name, reason, AGAIN)
-        scale = np.array(depth.shape[::-1]) / self.size
+        scale = np.array(depth.shape[::-1]) / size
         if abs(scale[0] / scale[1] - 1.0) > 0.02:
             raise InputError(name, "depth and colour have different aspect ratios", "export them registered")
-        K = self.K.copy()
+        K = K_colour.copy()
         K[[0, 1], [0, 1]] *= scale
         K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5
         small = Image.fromarray(rgb).resize(depth.shape[::-1], Image.Resampling.BOX)
         near = np.where(depth <= far, depth, np.float32(0.0))
-        return View(near, K, self.T_world_camera, np.array(small), name=name)
+        return View(near, K, T_world_camera, np.array(small), name=name)
+
+    return Frame(name, number, load, T_world_camera, round(time * SECOND))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -130,13 +128,14 @@ class _NerfFrame:
     camera_model: str = "PINHOLE"
 
 
-def _read_nerfstudio(path: Path, max_pixels: int) -> Iterator[_Shot]:
+def _read_nerfstudio(path: Path, config: RecordingConfig) -> Iterator[Frame]:
     """Frames of transforms.json: poses of OpenGL cameras in a world with z up; all are taken for sharp."""
     table = path / "transforms.json"
     document = read_json(table)
     frames = document.pop("frames", None)
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(table, "'frames' is not a list of objects", AGAIN)
+    make_frame = partial(_frame, path.resolve().name, config.far)
     for number, frame in enumerate(frames):
         where = f"{table}: frame {number}"
         known = parse_json(_NerfFrame, document | frame, where)
@@ -149,16 +148,11 @@ def _read_nerfstudio(path: Path, max_pixels: int) -> Iterator[_Shot]:
         if any((document | frame).get(name) for name in ("k1", "k2", "k3", "k4", "p1", "p2")):
             raise InputError(where, "its images are distorted (k1, k2, …)", "undistort them and depth first")
         K = np.array([[known.fl_x, 0.0, known.cx], [0.0, known.fl_y, known.cy], [0.0, 0.0, 1.0]])
-        unit = 1000.0 * known.depth_unit_scale_factor
-        yield _Shot(
-            number,
-            float(number),
-            known.transform_matrix @ GL,
-            check_intrinsics(K, where),
-            (int(known.w), int(known.h)),
-            partial(images.read_depth, path / known.depth_file_path, unit, max_pixels),
-            partial(images.decode_image, path / known.file_path, max_pixels=max_pixels),
-        )
+        unit, size = 1000.0 * known.depth_unit_scale_factor, (int(known.w), int(known.h))
+        T, K = known.transform_matrix @ GL, check_intrinsics(K, where)
+        depth = partial(images.read_depth, path / known.depth_file_path, unit, config.max_pixels)
+        colour = partial(images.decode_image, path / known.file_path, max_pixels=config.max_pixels)
+        yield make_frame(number, float(number), T, K, size, depth, colour)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -174,7 +168,7 @@ class _Record3D:
     fps: Annotated[float, Ge(0.001)] = 60.0
 
 
-def _read_record3d(path: Path, max_pixels: int) -> Iterator[_Shot]:
+def _read_record3d(path: Path, config: RecordingConfig) -> Iterator[Frame]:
     """Frames of an unzipped .r3d: poses of OpenGL cameras in ARKit's world."""
     with needs_extra("phone", path):
         import lzfse
@@ -189,32 +183,29 @@ def _read_record3d(path: Path, max_pixels: int) -> Iterator[_Shot]:
     table = _metadata(path)
     known = parse_json(_Record3D, read_json(table), table)
     K = check_intrinsics(known.K.reshape(3, 3).T, f"{table}: K")
+    make_frame = partial(_frame, path.resolve().name, config.far)
     for number, pose in enumerate(known.poses):
-        yield _Shot(
-            number,
-            number / known.fps,
-            Y_UP @ _pose([*pose[4:], *pose[:4]], f"{table}: pose {number}") @ GL,
-            K,
-            (known.w, known.h),
-            partial(read_depth, path / f"rgbd/{number}.depth"),
-            partial(images.decode_image, path / f"rgbd/{number}.jpg", max_pixels=max_pixels),
-        )
+        T = Y_UP @ _pose([*pose[4:], *pose[:4]], f"{table}: pose {number}") @ GL
+        depth = partial(read_depth, path / f"rgbd/{number}.depth")
+        colour = partial(images.decode_image, path / f"rgbd/{number}.jpg", max_pixels=config.max_pixels)
+        yield make_frame(number, number / known.fps, T, K, (known.w, known.h), depth, colour)
 
 
-def _read_stray(path: Path, max_pixels: int) -> Iterator[_Shot]:
+def _read_stray(path: Path, config: RecordingConfig) -> Iterator[Frame]:
     """Frames of Stray Scanner: poses of optical frames in ARKit's world; doubtful depth is dropped."""
     video = _Video(path / "rgb.mp4")
 
     def read_depth(number: int) -> NDArray[np.float32]:
-        depth = images.read_depth(path / f"depth/{number:06d}.png", 1.0, max_pixels)
+        depth = images.read_depth(path / f"depth/{number:06d}.png", 1.0, config.max_pixels)
         file = path / f"confidence/{number:06d}.png"
-        trusted = images.read_mask(file, max_pixels=max_pixels) if file.is_file() else np.array(True)
+        trusted = images.read_mask(file, max_pixels=config.max_pixels) if file.is_file() else np.array(True)
         if trusted.shape not in ((), depth.shape):
             raise BrokenImageError(file, "has another size than the depth image", AGAIN)
         return depth * trusted
 
     camera, table = path / "camera_matrix.csv", path / "odometry.csv"
     K = check_intrinsics(np.array([_numbers(row, camera, 3) for row in _read_csv(camera)]), str(camera))
+    make_frame = partial(_frame, path.resolve().name, config.far)
     header, *rows = _read_csv(table)
     if missing := [name for name in COLUMNS if name not in header]:
         raise InputError(table, f"the column '{missing[0]}' is missing", AGAIN)
@@ -223,15 +214,9 @@ def _read_stray(path: Path, max_pixels: int) -> Iterator[_Shot]:
         time, number, *pose = (told[name] for name in COLUMNS)
         if not (0.0 <= number < LATEST and abs(time) < LATEST):
             raise InputError(table, f"frame {number:g} at {time:g} s is impossible", AGAIN)
-        yield _Shot(
-            int(number),
-            time,
-            Y_UP @ _pose(pose, f"{table}: frame {number:.0f}"),
-            K,
-            video.size,
-            partial(read_depth, int(number)),
-            partial(video.decode, int(number)),
-        )
+        T, index = Y_UP @ _pose(pose, f"{table}: frame {number:.0f}"), int(number)
+        depth, colour = partial(read_depth, index), partial(video.decode, index)
+        yield make_frame(index, time, T, K, video.size, depth, colour)
 
 
 def _pose(numbers: Sequence[float], where: str) -> Array:
