@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -44,14 +44,17 @@ class _Mask:
 
 @dataclass(frozen=True, slots=True)
 class _Masks:
-    """The masks of a scene: file and `obj_id` (0 = unknown) of each mask of a frame.
+    """The masks of a scene: file and `obj_id` (0 = unknown) of each mask of a frame, and names of ids.
 
-    Where an `obj_id` names a model and not one object, labels count the masks of a view.
+    Where an `obj_id` names a model and not one object, labels count the masks of a view. Frames whose masks
+    overlap are noted when they are loaded.
     """
 
     frames: dict[int, list[tuple[Path, int]]]
     labels_are: Literal["objects", "segments"] = "objects"
     notes: tuple[str, ...] = ()
+    names: dict[int, str] | None = None
+    overlapping: list[int] = field(default_factory=list)
 
 
 def recognises(path: Path) -> bool:
@@ -108,12 +111,8 @@ def read_recording(
     known, most = _Masks({}), (config or RecordingConfig()).max_pixels
     if masks and (folder / f"mask_visib{end}").is_dir():
         known = _read_masks(folder / f"mask_visib{end}", folder / f"scene_gt{end}.json", set(cameras))
-    names = read_names(folder) if masks else None
-    overlaps: list[int] = []
-    frames = tuple(
-        _frame(folder, end, n, cameras[n], known, names, overlaps, f"{path}: frame {n}", most)
-        for n in sorted(cameras)
-    )
+    known = replace(known, names=read_names(folder) if masks else None)
+    frames = [_frame(folder, end, n, cameras[n], known, f"{path}: frame {n}", most) for n in sorted(cameras)]
     without = [f.number for f in frames if f.T_world_camera is None]
     if len(frames) > 1 and without:
         reason = f"{len(without)} of {len(frames)} frames have no pose (cam_R_w2c, cam_t_w2c)"
@@ -202,22 +201,14 @@ def _find_sensor(path: Path) -> tuple[Path, str]:
 
 
 def _frame(
-    folder: Path,
-    end: str,
-    number: int,
-    camera: _Camera,
-    known: _Masks,
-    names: dict[int, str] | None,
-    overlaps: list[int],
-    source: str,
-    max_pixels: int,
+    folder: Path, end: str, number: int, camera: _Camera, known: _Masks, source: str, max_pixels: int
 ) -> Frame:
     K = check_intrinsics(camera.cam_K.reshape(3, 3), f"{source}: cam_K")
     T_world_camera = _pose(camera, source)
     depth_path, rgb_path = _image(folder / f"depth{end}", number, DEPTH_ENDINGS), None
     if (folder / f"rgb{end}").is_dir():
         rgb_path = _image(folder / f"rgb{end}", number, COLOUR_ENDINGS)
-    name, masks = f"{folder.resolve().name}/{number:06d}", known.frames.get(number)
+    name, masks, names = f"{folder.resolve().name}/{number:06d}", known.frames.get(number), known.names
     if masks is not None and known.labels_are == "segments":
         names = names and {label: names[k] for label, (_, k) in enumerate(masks, 1) if k in names}
         masks = [(path, label) for label, (path, _) in enumerate(masks, 1)]
@@ -231,8 +222,8 @@ def _frame(
         labels = None
         if masks is not None:
             labels, shared = _read_labels(masks, depth, max_pixels)
-            if shared and not overlaps:  # frames are loaded several times, and one line is enough
-                overlaps.append(number)
+            if shared and not known.overlapping:  # frames are loaded several times, and one line is enough
+                known.overlapping.append(number)
                 said = "%s: masks overlap, in frame %d in %d pixels; each goes to the smallest mask"
                 log.info(said, folder / f"mask_visib{end}", number, shared)
         return View(
