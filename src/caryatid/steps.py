@@ -333,11 +333,6 @@ def _unfinished(folder: Path, about: Mapping[str, Any]) -> Run | None:
     return read_run(folder) if record.get("unfinished") and about.items() <= record.items() else None
 
 
-def lift_file(index: int) -> str:
-    """Picture of the lift after a view."""
-    return f"lifts/{index:02d}.png"
-
-
 def _view_folder(index: int) -> str:
     return f"views/{index:02d}"
 

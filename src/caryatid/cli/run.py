@@ -36,7 +36,7 @@ from caryatid.manipulation.clearing import SimulatedHands, clear
 from caryatid.runtime.parallel import cores
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.sources import Source, extract, is_name, kind_of, open_run, open_source
-from caryatid.steps import RunWriter, lift_file, read_config, read_steps
+from caryatid.steps import RunWriter, read_config, read_steps
 from caryatid.viz.report import draw_lift
 from caryatid.viz.tables import census, count_of
 
@@ -194,7 +194,7 @@ class RecordedLifts:
         self.done.append({"view": len(writer.steps)} | taken.to_json() | {"state": state})
         if taken.body is not None and robot is not None:
             lift = draw_lift(self._camera.scene, taken, graph, robot.T_world_camera, self._config)
-            writer.files[lift_file(len(writer.steps))] = lift
+            writer.files[f"lifts/{len(writer.steps):02d}.png"] = lift
         return taken.body is not None
 
 
