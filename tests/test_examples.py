@@ -9,12 +9,16 @@ import sys
 from pathlib import Path
 
 import nbformat
+import numpy as np
 import pytest
+
+from caryatid.config.settings import read_settings
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
+SENSORS = sorted((ROOT / "examples/sensors").glob("*.toml"))
 MOSD = ROOT.parent / "shared/data/mosd"
 
 
@@ -29,6 +33,16 @@ def test_the_client_is_one_small_file_that_needs_nothing_but_python():
     assert len(imported) > 5
     assert set(imported) <= sys.stdlib_module_names
     assert len(text.splitlines()) < 130
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "examples/sensors").glob("*.toml")), ids=lambda path: path.stem
+)
+def test_settings_of_a_sensor_agree_with_each_other(path):
+    config = read_settings(path, ())
+    assert config.cloud.min_depth == config.noise.range[0]
+    half = np.degrees(np.arctan(min(config.sensor.width, config.sensor.height) / 2.0 / config.sensor.focal))
+    assert 0.9 * half <= config.active.view_cone <= 1.5 * half
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

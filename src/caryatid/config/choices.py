@@ -22,7 +22,7 @@ DepthKind = Literal["axis", "ray"]
 """What readings of depth are."""
 GripperKind = Literal["none", "parallel", "suction"]
 """Grippers; with none, every object can be grasped."""
-GripperName = Literal["none", "parallel", "suction", "franka", "robotiq-85", "robotiq-140"]
+GripperName = Literal["none", "parallel", "suction", "franka", "robotiq-85", "robotiq-140", "so-101"]
 """Kinds of grippers, and those whose dimensions are known (`GRIPPERS`)."""
 ExportFormat = Literal[
     "mjcf", "urdf", "usd", "gltf", "moveit", "curobo", "pddl", "graphml", "dsg", "dot",

@@ -694,6 +694,7 @@ GRIPPERS: dict[str, GripperConfig] = {
     "franka": GripperConfig(kind="parallel", opening=0.08, length=0.045, breadth=0.204, turn=90.0),
     "robotiq-85": GripperConfig(kind="parallel", opening=0.085),
     "robotiq-140": GripperConfig(kind="parallel", opening=0.14),
+    "so-101": GripperConfig(kind="parallel", opening=0.09, finger=0.01, hand=0.06),
 }
 """Grippers by name; what is not known of one is as by default."""
 
