@@ -7,6 +7,7 @@ import re
 import shutil
 import tomllib
 from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from conftest import SMALL, SMALL_SENSOR, run_command, wall_of
 from PIL import Image
 from synthetic import hausdorff, simulated_views
 
+import caryatid
 from caryatid.config import Config
 from caryatid.geometry import transforms
 from caryatid.io.bop import read_recording, write_recording
@@ -321,3 +323,18 @@ def test_a_run_says_why_its_objects_are_what_they_are(kept_run, capsys):
     assert f"{first}: costs in nats" in capsys.readouterr().out
     assert run_command("why", kept_run) == 1
     assert "give one, or two" in capsys.readouterr().err
+
+
+def test_doctor_says_what_is_installed_and_which_package_of_an_extra_is_missing(monkeypatch, capsys):
+    def version(package):
+        if package == "viser":
+            raise PackageNotFoundError(package)
+        return "1.2.3"
+
+    monkeypatch.setattr("caryatid.cli.results.version", version)
+    assert run_command("doctor", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["caryatid"] == caryatid.__version__
+    assert "viser is missing" in found["extra view"]
+    assert found["extra usd"] == "usd-core 1.2.3"
+    assert not {"extra dev", "extra docs", "extra all"} & found.keys()

@@ -513,6 +513,14 @@ class Scenes(options.Command, work="commands:print_scenes"):
     """
 
 
+class Doctor(options.Command, work="results:describe_installation"):
+    """Say what is installed and what is missing: versions, system, compiled kernels, Chromium, extras.
+
+    Usage examples:
+      caryatid doctor
+    """
+
+
 class Config(options.Command, work="commands:print_config"):
     """Print all settings as TOML, to edit and pass to --config.
 
@@ -542,7 +550,7 @@ COMMANDS: dict[str, type[options.Command | Session]] = {
     command.__name__.lower(): command
     for command in (
         Demo, Check, Explore, Extract, View, Evaluate, Order, Clear, Import, Report, Describe, Why, Export,
-        Benchmark, Session, Serve, Scenes, Config, Completion,
+        Benchmark, Session, Serve, Scenes, Doctor, Config, Completion,
     )
 }  # fmt: skip
 """The commands in the order of the help."""

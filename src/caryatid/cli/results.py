@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+import platform
+import re
 import time
 from contextlib import closing
+from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import repeat
 from pathlib import Path
 
 from rich.progress import MofNCompleteColumn, Progress
 
+from caryatid import __version__
 from caryatid.benchmark.episodes import Episode, short_name
 from caryatid.benchmark.report import check_reference
 from caryatid.benchmark.report import write_report as write_benchmark
@@ -17,7 +21,18 @@ from caryatid.benchmark.running import run_locally, run_on_cluster
 from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES, change_suite
 from caryatid.cli import NOT_SAFE
-from caryatid.cli.commands import Benchmark, Check, Describe, Evaluate, Export, Import, Order, Report, Why
+from caryatid.cli.commands import (
+    Benchmark,
+    Check,
+    Describe,
+    Doctor,
+    Evaluate,
+    Export,
+    Import,
+    Order,
+    Report,
+    Why,
+)  # fmt: skip
 from caryatid.cli.output import kept, table
 from caryatid.config import Config
 from caryatid.errors import InputError, needs_extra
@@ -31,10 +46,11 @@ from caryatid.manipulation import order as orders
 from caryatid.runtime import fingerprint
 from caryatid.runtime.parallel import cores
 from caryatid.segmentation.diagnosis import diagnose
+from caryatid.simulation.warm_up import is_warm
 from caryatid.sources import kind_of, open_run, read_model, read_scene
 from caryatid.steps import Run, read_config, read_steps
 from caryatid.viz.check_report import SHOWN, make_check_report
-from caryatid.viz.report import make_report, print_pdf, read_lift, render_html
+from caryatid.viz.report import find_chromium, make_report, print_pdf, read_lift, render_html
 from caryatid.viz.tables import Table, census, count_of, describe, order_line, order_table, tell_lifts
 
 
@@ -315,3 +331,21 @@ def _report_benchmark(command: Benchmark, store: ResultStore) -> None:
     if suites:
         output.say(f"figures: {command.out / 'index.html'}")
     output.result({"results": str(command.out), "suites": suites}, "")
+
+
+def describe_installation(command: Doctor) -> None:
+    kernels = "compiled" if is_warm() else "not compiled: the first run takes half a minute longer"
+    found = {
+        "caryatid": __version__, "Python": platform.python_version(), "system": platform.platform(),
+        "cores": str(cores()), "kernels": kernels, "Chromium": find_chromium() or "not found: no PDFs",
+    }  # fmt: skip
+    for line in requires("caryatid") or ():
+        package, extra = re.findall(r"^([\w-]+)(?:.*extra == .(\w+))?", line)[0]
+        if extra not in ("", "all", "dev", "docs", "bench"):
+            try:
+                known = version(package)
+            except PackageNotFoundError:
+                known = "is missing"
+            name = f"extra {extra}"
+            found[name] = ", ".join(filter(None, (found.get(name), f"{package} {known}")))
+    command.output.result(found, table("Installation", ("what", "found"), found.items()))
