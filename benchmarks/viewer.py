@@ -36,7 +36,7 @@ def measure_viewer(effort: Effort) -> list[Row]:
     exploring = time.process_time() - began
     large = replace(steps[-1], cloud=_enlarged(steps[-1].cloud), stop=None)
 
-    page = Page("benchmark", config.support)
+    page = Page("benchmark", config)
     page.show_layer("cloud", True)
     root, token = page.url.rsplit("/", 1)
     address, protocol = f"{root.replace('http', 'ws')}/{token}", Subprotocol(f"viser-v{viser.__version__}")
@@ -44,7 +44,7 @@ def measure_viewer(effort: Effort) -> list[Row]:
         shown = [_until_shown(page, _numbered(large, k), browser) for k in range(effort.runs + 2)][2:]
     page.close()
 
-    page = Page("benchmark", config.support)
+    page = Page("benchmark", config)
     began = time.process_time()
     for step in steps:
         page.add(step)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,8 +12,12 @@ from raycast import TABLE, from_the_side, table_scene
 from scipy import ndimage
 from synthetic import SENSOR, box, cylinder, look_from, model_of, sphere, surface_points
 
+from caryatid.config import FitConfig, VoxelConfig
 from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box
+from caryatid.objects import solids
 from caryatid.sensing.views import Cloud
+from caryatid.sensing.voxel_map import FREE, UNKNOWN
 from caryatid.simulation import generation
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.world import Body, build_spec, scene_from_spec
@@ -123,3 +128,16 @@ def test_household_things_are_seen_in_their_shape_and_hollow_ones_hollow(make):
     true, own = (shape.signed_distance(points) for shape in (truth, found.shape))
     assert (own[true > 0.006] > 0.0).mean() > 0.95
     assert (own[true < 0.0] < 0.004).mean() > 0.8
+
+
+def test_a_cavity_that_would_leave_nothing_of_an_object_is_none(monkeypatch):
+    crate = Box(np.eye(4), np.array([0.2, 0.15, 0.1]))
+    points, normals = crate.surface(0.004)
+    voxels = SimpleNamespace(
+        config=VoxelConfig(size=0.01),
+        state_at=lambda p: np.where(crate.signed_distance(p) < 0.0, FREE, UNKNOWN),
+    )
+    evidence = SimpleNamespace(points=points, normals=-normals, noise=1e-4, voxels=voxels)
+    monkeypatch.setattr(solids, "_cavity", lambda *_: [(np.array([0.0, 0.0, 1.0]), -1.0)])
+    found = solids._solid(points, -normals, points[:0], evidence, FitConfig())
+    assert found.volume == pytest.approx(crate.volume, rel=0.1)

@@ -109,8 +109,9 @@ def _solid(
         tried[seed] = True
         eye = _free_point(places[seed], outward[seed], float(empty[seed]), voxels)
         planes = [] if eye is None else _cavity(eye, hull, faces, facing, tolerance)
-        if planes:
-            parts = [piece for part in parts for piece in hollowed(part, planes)]
+        left = [piece for part in parts for piece in hollowed(part, planes)] if planes else []
+        if left:  # What leaves nothing is no cavity.
+            parts = left
             tried |= np.all([places @ n - d > -2.0 * tolerance for n, d in planes], axis=0)
     return Solid.of(parts)
 
