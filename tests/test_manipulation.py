@@ -407,10 +407,11 @@ class TestCommands:
             assert step.keys() == {"object", "hold", "safe", "risk", "probability", "why"}
             assert (step["safe"], step["hold"], step["probability"]) == (True, [], 1.0 - step["risk"])
         assert run_command("order", kept_run, "--goal", "o2", *QUICK) == 0
-        assert capsys.readouterr().out == f"{kept_run}: safe order (whole order: 83%): o2\n"
+        assert capsys.readouterr().out == f"{kept_run}: safe order (nothing else moves: 83%): o2\n"
         assert run_command("order", kept_run, "--gripper", "parallel", *QUICK) == 3
         table = capsys.readouterr().out
-        assert "safe as far as it goes (83%): o2\n1 of 2 objects can be removed; o1 cannot be" in table
+        assert "safe as far as it goes (nothing else moves: 83%): o2\n" in table
+        assert "1 of 2 objects can be removed; o1 cannot be" in table
         assert "gripper, opening 140 mm" in table
         assert re.search(r"│ 1 │ o2 +│ – +│ 0.83 ", table)
         assert max(len(line) for line in table.splitlines() if line[0] in "┏┃│") <= 80
@@ -503,7 +504,7 @@ class TestCommands:
 
     @pytest.mark.parametrize(
         ("name", "segmentation", "why", "views"),
-        [("clear", "labels", "is not an object of the scene; known objects: o1, o2", None),
+        [("clear", "labels", "is not the id of an object; known objects: o1 (crate), o2 (can)", None),
          ("clear", "auto", "was not found in 2 views; objects found: o1, o2", 2),
          ("explore", "auto", "was not found in 2 views; objects found: o1, o2", 2)],
     )  # fmt: skip

@@ -617,7 +617,7 @@ def test_a_person_goes_on_and_back_chooses_a_view_by_hand_and_clears(seen):
     tab.page.get_by_text("Why a cylinder").wait_for(state="hidden")
     tab.page.get_by_text("order", exact=True).click()
     tab.press("plan order")
-    tab.wait_for_text("Safe order (whole order")
+    tab.wait_for_text("Safe order (nothing else moves")
     page.describe("o2")
     tab.press("clear the table")
     tab.wait_for_text("Finished: no objects are left; no other object moved.")

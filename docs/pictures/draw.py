@@ -239,7 +239,7 @@ def viewer(browser: Any) -> Iterator[tuple[str, Image.Image]]:
         yield "object", shot(tab)
         page.describe("")
         tab.page.get_by_text("order", exact=True).click()
-        page._gripper.value = "franka"
+        page._gripper.value = "robotiq-140"
         tab.press("plan order")
         tab.wait_for_text("after view 3")
         yield "order", shot(tab)

@@ -158,11 +158,13 @@ def find_order(command: Order) -> int:
             graph, config, goal=command.goal, hands=command.hands, seed=seed, threads=cores(),
             voxels=voxels, reachable=reachable,
         )  # fmt: skip
-    steps = order_table(order, brief=True)
+    steps = order_table(order, brief=True, graph=graph)
     rows = [[entry.text for entry in row] for row in steps.rows]
     shown = table(f"Steps{describe_gripper(config)}", steps.columns, rows) if rows else ""
     refusal = f"{order.refusal}\n" if order.refusal else ""
-    command.output.result(order.to_json(), f"{command.run}: {order_line(order)}\n", refusal, shown)
+    if config.gripper.kind != "none" and voxels is None:
+        command.output.say("a run does not store unseen space: only known shapes are in the gripper's way")
+    command.output.result(order.to_json(), f"{command.run}: {order_line(order, graph)}\n", refusal, shown)
     return 0 if order.safe else NOT_SAFE
 
 

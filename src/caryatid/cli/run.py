@@ -224,10 +224,10 @@ def _check_goal(command: Explore | Clear, source: Source, config: Config) -> Non
     others = command.segmentation == "auto" or command.settings.masks_from is not None
     if goal is None or others or config.fusion.masks != "scene" or not isinstance(camera, SimulatedCamera):
         return
-    ids = [object_id(label) for label in camera.scene.object_bodies]
-    if goal not in ids:
-        reason = "is not an object of the scene"
-        raise GoalError(f"--goal {goal}", reason, f"known objects: {', '.join(ids)}")
+    bodies = {object_id(label): body for label, body in camera.scene.object_bodies.items()}
+    if goal not in bodies:
+        known = ", ".join(f"{i} ({body})" for i, body in bodies.items())
+        raise GoalError(f"--goal {goal}", "is not the id of an object", f"known objects: {known}")
 
 
 def _check_found(goal: str | None, last: Step) -> None:

@@ -378,7 +378,7 @@ class Page:
         drawn = draw_linked_graph(graph, chosen, f"/{self.url.rpartition('/')[2]}/object")
         texts = [
             (self._summary, describe_view(step, f1, count, before)), (self._graph, drawn),
-            (self._lifts, describe_lifts(order, lifts, number)),
+            (self._lifts, describe_lifts(steps[-1].graph, order, lifts, number)),
             (self._image, draw_view(steps[-1], self._kind.value)),
         ]  # fmt: skip
         if any(f1 is not None for f1 in scores):

@@ -66,7 +66,7 @@ def describe_object(
     return cell_html(Section(item.title, item.shape.kind, facts=facts, colour=object_colour(item.label)))
 
 
-def describe_lifts(order: Order | None, lifts: Sequence[TakeStep], view: int) -> str:
+def describe_lifts(graph: SupportGraph, order: Order | None, lifts: Sequence[TakeStep], view: int) -> str:
     """Describe an order planned from the graph after a view, if there is one, and the lifts made so far."""
 
     def told(steps: Sequence[TakeStep]) -> list[tuple[str, str]]:
@@ -79,7 +79,7 @@ def describe_lifts(order: Order | None, lifts: Sequence[TakeStep], view: int) ->
         hint = "Plan an order to see what to lift first, and how surely nothing else moves."
         parts.append(cell_html(Section("", hint)))
     else:
-        line = order_line(order)
+        line = order_line(order, graph)
         text = f"after view {view}: {line[0].upper()}{line[1:]}."
         facts = [*told(order.steps), *([("Refused", order.refusal)] if order.refusal else [])]
         parts.append(cell_html(Section("Order", text, facts=facts)))

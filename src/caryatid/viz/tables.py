@@ -120,30 +120,30 @@ def point_table(decision: Decision | None) -> Table:
     return Table.of("Points of interest", ("objects", "saliency", "reason"), rows)
 
 
-def order_line(order: Order) -> str:
+def order_line(order: Order, graph: SupportGraph) -> str:
     """Say whether an order is safe, how probably all of it is, and what to remove."""
     if not order.steps:
         return "no lift is possible"
-    head, likely = "no safe order; the least risky one", f"{1.0 - order.risk:.0%}"
-    if order.safe:
-        head, likely = "safe order", f"whole order: {likely}"
-    elif all(step.safe for step in order.steps):
-        head = "safe as far as it goes"
-    taken = ", ".join(s.object_id + "".join(f" (hold {i})" for i in s.hold) for s in order.steps)
-    return f"{head} ({likely}): {taken}"
+    head = "no safe order; the least risky one"
+    if all(step.safe for step in order.steps):
+        head = "safe order" if order.safe else "safe as far as it goes"
+    held = ("".join(f" (hold {graph[i].title})" for i in s.hold) for s in order.steps)
+    taken = ", ".join(graph[s.object_id].title + hold for s, hold in zip(order.steps, held, strict=True))
+    return f"{head} (nothing else moves: {1.0 - order.risk:.0%}): {taken}"
 
 
-def order_table(order: Order, *, brief: bool = False) -> Table:
-    """Make the table of the steps of an order; if brief, of those that are not alike.
+def order_table(order: Order, *, brief: bool = False, graph: SupportGraph | None = None) -> Table:
+    """Make the table of the steps of an order, with the names of a graph; if brief, of those not alike.
 
     Alike are safe steps with the lowest risk, without a hold or a grasp.
     """
+    names = {} if graph is None else {o.id: o.title for o in graph.objects}
     least = min((step.risk for step in order.steps), default=0.0) + 0.005
     rows = (
         (
             str(number),
-            Entry(step.object_id, object_colour(label_of(step.object_id))),
-            ", ".join(step.hold) or "–",
+            Entry(names.get(step.object_id, step.object_id), object_colour(label_of(step.object_id))),
+            ", ".join(names.get(i, i) for i in step.hold) or "–",
             Entry(f"{1.0 - step.risk:.2f}{'' if step.safe else ', too low'}", doubt=not step.safe),
             step.why,
         )
