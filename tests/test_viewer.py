@@ -619,7 +619,7 @@ def test_a_person_goes_on_and_back_chooses_a_view_by_hand_and_clears(seen):
     tab.press("plan order")
     tab.wait_for_text("Safe order (nothing else moves")
     page.describe("o2")
-    tab.press("clear the table")
+    tab.press("clear the simulated table")
     tab.wait_for_text("Finished: no objects are left; no other object moved.")
     tab.wait_for_node("/shapes/o1", there=False)
     tab.wait_for_node("/shapes/o2", there=False)

@@ -243,7 +243,7 @@ def viewer(browser: Any) -> Iterator[tuple[str, Image.Image]]:
         tab.press("plan order")
         tab.wait_for_text("after view 3")
         yield "order", shot(tab)
-        tab.press("clear the table")
+        tab.press("clear the simulated table")
         page.wait()
         tab.wait_for_text("finished")
         yield "cleared", shot(tab)

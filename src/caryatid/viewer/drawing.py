@@ -142,6 +142,7 @@ class SceneDrawing:
         steps: Sequence[Step],
         *,
         chosen: str = "",
+        order: Sequence[str] = (),
         lift: TakeStep | None = None,
         gripper: GripperConfig | None = None,
         point_size: float = 0.003,
@@ -149,7 +150,8 @@ class SceneDrawing:
     ) -> None:
         """Show a step, with the cameras of all steps so far, in place of the one before.
 
-        An object may stand out, and a gripper may be at a lift's grasp; points have a diameter [m], and their
+        An object may stand out, objects may have their places in an order, and a gripper may be at a lift's
+        grasp; points have a diameter [m], and their
         objects' colours or their own.
         """
         decision = step.decision
@@ -159,7 +161,7 @@ class SceneDrawing:
         layers: dict[str, tuple[object, ...]] = {
             "cloud": (step.cloud, point_size, true_colours),
             "shapes": (step.graph, chosen if any(o.id == chosen for o in step.graph.objects) else ""),
-            "names": (step.graph,),
+            "names": (step.graph, tuple(order)),
             "supports": (step.graph,),
             "gripper": (None if lift is None else lift.grasp, gripper),
             "grid": (min(surfaces[:, 2], default=0.0), max(surfaces[:, 2], default=0.0) + 0.002),
@@ -236,9 +238,11 @@ class SceneDrawing:
         self._remove("shapes", nodes)
         return nodes
 
-    def _names(self, graph: SupportGraph) -> list[Any]:
-        found = named_objects(graph)
-        return [self._label(f"/names/{item.id}", item.id, item.centre_world) for item in found]
+    def _names(self, graph: SupportGraph, order: tuple[str, ...]) -> list[Any]:
+        """Names and ids, after their places in an order."""
+        places = {name: f"{number}. " for number, name in enumerate(order, start=1)}
+        tags = [(item, places.get(item.id, "") + item.title) for item in named_objects(graph)]
+        return [self._label(f"/names/{item.id}", text, item.centre_world) for item, text in tags]
 
     def _label(self, name: str, text: str, at: Array) -> Any:
         look: dict[str, Any] = {"anchor": "center-center", "font_screen_scale": 1.1}

@@ -282,6 +282,7 @@ class Page:
             command = gui.add_command("Earlier view" if way < 0 else "Later view", hotkey=key)
             command.on_trigger(lambda _, way=way: self.go_to(self._shown + way))
         self.server.scene.on_click()(self._point)
+        self.server.on_client_connect(self._greet)
         if self._small:
             panel.minimize()
         else:
@@ -300,7 +301,7 @@ class Page:
         self._plan = gui.add_button("plan order", hint=hint)
         self._play = gui.add_button("play", disabled=True, hint="Show the lifts one after the other")
         hint = "Look until a lift is safe, remove the object, look again, until the table is empty"
-        self._clear = gui.add_button("clear the table", hint=hint, visible=False)
+        self._clear = gui.add_button("clear the simulated table", hint=hint, visible=False)
         self._lifts = gui.add_html("")
         self._plan.on_click(lambda _: self.do("planning an order", self.plan))
         self._play.on_click(lambda _: self.do("showing the lifts", self.play))
@@ -332,10 +333,16 @@ class Page:
         camera.fov = 0.72  # Narrow, so that near objects do not hide far ones [rad].
         camera.position = centre + 3.2 * reach * direction(azimuth, 0.55)  # From 3.2 radii, all objects fit.
 
+    def _greet(self, client: Any) -> None:
+        """Move back the eye of a window higher than wide, such as a phone's, until all objects fit."""
+        if self.steps and client.camera.aspect < 1.0:
+            self._look_from("start", client.camera)
+
     def _look_from(self, where: str, eye: Any) -> None:
         """Move a browser's eye."""
         start = self.server.initial_camera
-        position, target, up, fov = start.position, start.look_at, np.array([0.0, 0.0, 1.0]), start.fov
+        target, up, fov = start.look_at, np.array([0.0, 0.0, 1.0]), start.fov
+        position = target + (start.position - target) / min(eye.aspect, 1.0)
         view = self.steps[self._shown].view if self.steps else None
         if where == "above":
             away = position - target
@@ -394,7 +401,8 @@ class Page:
         look = {"point_size": self._size.value / 1000.0, "true_colours": self._true_colours.value}
         # Scene and texts change together.
         with self.server.atomic():
-            self.drawing.show(step, steps, chosen=chosen, lift=lift, gripper=gripper, **look)
+            places = () if order is None else [each.object_id for each in order.steps]
+            self.drawing.show(step, steps, chosen=chosen, order=places, lift=lift, gripper=gripper, **look)
             self._slider.visible = count > 1
             self._slider.max = max(count, 2)
             self._slider.value = number

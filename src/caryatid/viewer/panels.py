@@ -135,6 +135,7 @@ def describe_signs() -> str:
     signs = {
         "Arrow": "supporter → supported, at their contact; thicker = more probable, dashed = doubtful. "
         "Supports by a support surface are drawn only if doubtful",
+        "Number before a name": "its place in the order",
         "Number on an arrow": "probability of the support, if below 1",
         "Number in the graph": "views that found the object, of those that could have shown it",
         "Grid": "10 cm, under the support surface; red and green: x and y of the world, from x = y = 0",
