@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -113,6 +114,8 @@ def test_a_folder_gives_the_masks_and_numbers_mean_nothing_between_views(tmp_pat
         objects = np.unique(view.labels[(view.labels > 0) & (view.labels != SUPPORT_LABEL)])
         names = rng.permutation(np.arange(1, len(objects) + 1))
         stack = np.stack([view.labels == k for k in objects[np.argsort(names)]])
+        said = {int(n): f"thing {k}" for k, n in zip(objects, names, strict=True)}
+        (folder / f"{number:06d}.json").write_text(json.dumps(said))
         if number % 2:
             np.save(folder / f"{number:06d}.npy", stack)
         else:
@@ -120,12 +123,17 @@ def test_a_folder_gives_the_masks_and_numbers_mean_nothing_between_views(tmp_pat
             for k, mask in enumerate(stack, start=1):
                 labels[mask] = k
             (folder / f"{number:06d}.png").write_bytes(png(labels))
+    (folder / "names.json").write_text('{"1": "for views without names of their own"}')
     out = ("--no-report", "--quiet", "--out")
     assert run_command("extract", recording, *out, tmp_path / "named") == 0
     assert run_command("extract", recording, "--masks", folder, *out, tmp_path / "from") == 0
     named, given = (read_run(tmp_path / name).graph for name in ("named", "from"))
     assert len(given.objects) == len(named.objects)
     assert len(given.supports) == len(named.supports)
+    shown = {f"thing {k}" for view in views for k in np.unique(view.labels) if 0 < k < SUPPORT_LABEL}
+    things = [o.name for o in given.objects if o.role == "object"]
+    assert len(things) == len(set(things)), "an object has one name, from the file of each view"
+    assert set(things) <= shown
     (folder / "000001.npy").unlink()
     assert run_command("extract", recording, "--masks", folder, *out, tmp_path / "broken") == 1
 

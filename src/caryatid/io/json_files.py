@@ -102,13 +102,14 @@ def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any
     return document
 
 
-def read_names(folder: Path) -> dict[int, str] | None:
-    """Read `names.json`, the names of labels, from a folder of masks; None without it.
+def read_names(folder: Path, view: str = "names") -> dict[int, str] | None:
+    """Read the names of labels from a folder of masks: `VIEW.json`, or else `names.json`; None without.
 
     Raises:
         InputError: It is broken, or not an object of texts by number.
     """
-    path, remedy = folder / "names.json", 'write the name of each label: {"1": "mug"}'
+    own, remedy = folder / f"{view}.json", 'write the name of each label: {"1": "mug"}'
+    path = own if own.exists() else folder / "names.json"
     return parse_json(dict[int, str], read_json(path, remedy), path, remedy) if path.exists() else None
 
 

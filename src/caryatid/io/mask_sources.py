@@ -46,7 +46,8 @@ def with_stored_masks(folder: Path, view: View, max_pixels: int) -> View:
     """Return a view with masks from the file named after it: a label image `NAME.png`, or `NAME.npy`.
 
     NAME is the view's after the last slash. A `.npy` holds labels (H, W) or a stack of masks (N, H, W),
-    boolean or scores. `names.json` in the folder may name labels: {"1": "mug"}.
+    boolean or scores. `NAME.json` may name the labels of this view, {"1": "mug"}, and `names.json` those of
+    views without one.
 
     Raises:
         InputError: There is no such file, or it is broken or of another size.
@@ -59,7 +60,7 @@ def with_stored_masks(folder: Path, view: View, max_pixels: int) -> View:
         labels = read_npy(array)
     else:
         raise InputError(folder, f"has no masks for '{name}'", f"add {image.name} or {array.name}")
-    return replace(view, labels=labels, labels_are="segments", names=read_names(folder))
+    return replace(view, labels=labels, labels_are="segments", names=read_names(folder, name))
 
 
 def without_ignored(view: View, ignore: Path, max_pixels: int) -> View:
