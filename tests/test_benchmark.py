@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from itertools import product
 
@@ -335,3 +336,13 @@ def test_the_command_writes_tables_figures_and_pages_of_finished_episodes(tmp_pa
     assert parquet["f1"].dropna().tolist() == known
     assert run_command("benchmark", "--out", out, "--reference", "nobody") == 1
     assert "unknown method; choose one of support, random, oracle" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_terminal_says_of_each_method_whether_it_is_better(tmp_path, capsys):
+    fill(tmp_path / RESULTS, ("random", "support", "oracle"), scenes=4)
+    assert run_command("benchmark", "--out", tmp_path, "--reference", "support") == 0
+    said = capsys.readouterr().err
+    for method, verdict in (("random", "worse"), ("oracle", "better")):
+        line = rf"^planners, .*: {method} against support: F1 at view 3 .0\.\d.*, {verdict}$"
+        assert re.search(line, said, re.M), said

@@ -133,6 +133,22 @@ class SuiteResult:
             for condition, rows in conditions_of(self.summary)
         }
 
+    @property
+    def measures(self) -> Mapping[str, str]:
+        """Measures with a column for each view and their headings, the main one first."""
+        lifts = self.summary["value"][self.summary["quantity"] == "lifts"]
+        return REMOVAL if (lifts > 0.0).any() else BY_VIEW
+
+    def verdicts(self) -> Iterator[str]:
+        """Say of each method whether its main measure at the last view differs from the reference's."""
+        main, heading = next(iter(self.measures.items()))
+        rows = self.summary.query(f"quantity == '{main} difference' and family == ''")
+        for (condition, method), own in rows.groupby(["condition", "method"], sort=False):
+            view, *found = own[["at", "value", "low", "high"]].iloc[-1]
+            said = "better" if found[1] > 0.0 else "worse" if found[2] < 0.0 else "not told apart"
+            figures = f"{heading} at view {view:.0f} {_text(f'{main} difference', *found).strip('*')}"
+            yield f"{self.name}, {condition}: {method} against {self.reference}: {figures}, {said}"
+
 
 def write_report(
     store: ResultStore, folder: Path, *, reference: str | None = None, document: Path | None = None
@@ -147,6 +163,9 @@ def write_report(
     """
     results = summarise_store(store, reference)
     _write_tables(store, folder)
+    for result in results:
+        for verdict in result.verdicts():
+            logging.getLogger(__name__).info(verdict)
     if results:
         command = f"caryatid benchmark --out {folder.name}"
         if reference is not None:
@@ -283,8 +302,7 @@ def _suite(result: SuiteResult) -> Iterator[str | Figure]:
     """The parts of a suite's report, from top to bottom."""
     known, summary = SUITES.get(result.name), result.summary
     conditions = summary["condition"].nunique()
-    removal = bool((summary["value"][summary["quantity"] == "lifts"] > 0.0).any())
-    measures = REMOVAL if removal else BY_VIEW
+    measures = result.measures
     main, heading = next(iter(measures.items()))
     yield f"## {_plain(result.name)}"
     failed = f"{len(result.failures)} failed" if result.failures else "none failed"

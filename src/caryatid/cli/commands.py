@@ -338,7 +338,7 @@ class Benchmark(options.Command, work="results:compare_methods"):
     scenes: Annotated[options.Words, options.shown("SCENE")] = ()
     """Replace the suite's scenes: a built-in name, a scene folder, or a folder of those; may be repeated."""
     planner: options.Several[Annotated[str, options.planner_name()]] = ()
-    """Replace the suite's planners; may be repeated. The first is the reference for the others."""
+    """Replace the suite's planners, by name or as module:Class; may be repeated."""
     fusion: options.Several[FusionMethod] = ()
     """Replace the suite's fusion; may be repeated."""
     segmentation: options.Several[SegmentationMethod] = ()
@@ -360,7 +360,7 @@ class Benchmark(options.Command, work="results:compare_methods"):
     retry: options.Flag = False
     """Run failed episodes again."""
     reference: Annotated[str | None, options.shown("METHOD")] = None
-    """Reference method in the figures, instead of the suite's."""
+    """Method that the others are compared with, instead of the suite's or, without that one, the first."""
     docs: Annotated[Path | None, options.shown("FILE.md")] = None
     """Also write the results as a Markdown document."""
 
