@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+import inspect
 import json
 import re
 import shlex
@@ -12,6 +13,7 @@ import shutil
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from PIL import Image
 
 import caryatid as ct
 from caryatid.cli import NOT_SAFE
+from caryatid.cli.commands import COMMANDS
 from caryatid.config.settings import write_settings
 from caryatid.io.images import png
 from caryatid.robots.reachability import sample_reachability, write_reachability
@@ -204,6 +207,16 @@ def test_the_names_people_use_are_in_the_reference_of_python():
         home = getattr(ct, name).__module__
         assert home in documented or f"autoclass:: {name}\n" in pages, name
         assert f"`ct.{name} <{home}.{name}>`" in index, name
+
+
+def test_what_pages_repeat_is_as_in_the_code():
+    lists = {"reference.md": COMMANDS, "settings.md": get_type_hints(ct.Config)}
+    for page, known in lists.items():
+        listed = (DOCS / page).read_text().split("## Every command")[-1]
+        rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", listed, re.M)
+        assert rows == [(name, inspect.getdoc(kind).partition("\n")[0]) for name, kind in known.items()]
+    for file in ("src/above_first.py", "pyproject.toml"):
+        assert (ROOT / "examples/planner_package" / file).read_text() in (DOCS / "planners.md").read_text()
 
 
 def slugs(page: Path) -> set[str]:
