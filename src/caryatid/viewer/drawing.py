@@ -90,7 +90,7 @@ def step_of_scene(scene: Scene) -> Step:
 
 
 def without(step: Step, gone: Collection[str], lifted: str, T_world_world: Mapping[str, Array]) -> Step:
-    """A step as it looks while an object is being lifted and others are gone.
+    """A step as it looks while an object is being lifted, others are gone, and some moved by T (4, 4).
 
     Shapes that have moved leave their points behind, and so their points are not shown.
     """
