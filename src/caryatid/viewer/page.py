@@ -91,7 +91,7 @@ class Page:
         self._config, self._seed, self._small = config or Config(), seed, small
         self._shown, self._chosen = -1, ""
         self._staged: Step | None = None
-        self._planned: tuple[SupportGraph, Order, GripperConfig] | None = None
+        self._planned: tuple[SupportGraph, Order, GripperConfig, str] | None = None
         self._drawer, self._worker = ThreadPoolExecutor(1, "viewer"), ThreadPoolExecutor(1, "loop")
         self._pending: Future[None] | None = None
         self._busy, self._running, self._playing = False, Event(), Event()
@@ -179,10 +179,11 @@ class Page:
         """
         graph, goal = self.steps[self._shown].graph, None if self._goal.value == ALL else self._goal.value
         gripper = choose_gripper(self._gripper.value, self._config.gripper)
-        config = replace(self._config, gripper=gripper)
+        config, named = replace(self._config, gripper=gripper), f"gripper {self._gripper.value}"
+        named += f", goal {self._goal.value}"
         with self.working:
             order = plan_order(graph, config, goal=goal, seed=self._seed, threads=cores())
-        self._planned = graph, order, gripper
+        self._planned = graph, order, gripper, named
         return ""
 
     def play(self) -> str:
@@ -209,7 +210,6 @@ class Page:
     def _show_state(self, text: str, *, busy: bool) -> None:
         self._busy = busy
         self._bar.visible = busy
-        self._plan.disabled = busy
         self.say(text)
         self.redraw()
 
@@ -298,7 +298,7 @@ class Page:
         hint = "Reach one object, and remove only what is in its way"
         self._goal = gui.add_dropdown("goal", [ALL], hint=hint)
         hint = "Find what to lift first, and then next, so that nothing else moves"
-        self._plan = gui.add_button("plan order", hint=hint)
+        self._plan = gui.add_button("plan order", disabled=True, hint=hint)
         self._play = gui.add_button("play", disabled=True, hint="Show the lifts one after the other")
         hint = "Look until a lift is safe, remove the object, look again, until the table is empty"
         self._clear = gui.add_button("clear the simulated table", hint=hint, visible=False)
@@ -378,14 +378,14 @@ class Page:
         graph = step.graph
         before = steps[-2] if len(steps) > 1 else None
         lifts = [each.lift for each in steps if each.lift is not None]
-        order, gripper = None, None
+        order, gripper, asked = None, None, ""
         if self._planned is not None and self._planned[0] is steps[-1].graph:
-            _, order, gripper = self._planned
+            _, order, gripper, asked = self._planned
         lift = None if order is None or self._staged is not None else _lift_of(order, chosen)
         drawn = draw_linked_graph(graph, chosen, f"/{self.url.rpartition('/')[2]}/object")
         texts = [
             (self._summary, describe_view(step, f1, count, before)), (self._graph, drawn),
-            (self._lifts, describe_lifts(steps[-1].graph, order, lifts, number)),
+            (self._lifts, describe_lifts(steps[-1].graph, order, lifts, f"after view {number}; {asked}")),
             (self._image, draw_view(steps[-1], self._kind.value)),
         ]  # fmt: skip
         if any(f1 is not None for f1 in scores):
@@ -407,6 +407,7 @@ class Page:
             self._slider.max = max(count, 2)
             self._slider.value = number
             self._about.visible = bool(chosen)
+            self._plan.disabled = self._busy
             self._play.disabled = self._busy or order is None or not order.steps
             goals = (ALL, *(o.id for o in steps[-1].graph.objects if o.role == "object"))
             if self._goal.options != goals:

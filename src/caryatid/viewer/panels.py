@@ -66,8 +66,8 @@ def describe_object(
     return cell_html(Section(item.title, item.shape.kind, facts=facts, colour=object_colour(item.label)))
 
 
-def describe_lifts(graph: SupportGraph, order: Order | None, lifts: Sequence[TakeStep], view: int) -> str:
-    """Describe an order planned from the graph after a view, if there is one, and the lifts made so far."""
+def describe_lifts(graph: SupportGraph, order: Order | None, lifts: Sequence[TakeStep], asked: str) -> str:
+    """Describe an order, if there is one, and for what it was asked; and the lifts made so far."""
 
     def told(steps: Sequence[TakeStep]) -> list[tuple[str, str]]:
         return [(f"{number}. {s.object_id}", _describe_lift(s)) for number, s in enumerate(steps, start=1)]
@@ -80,7 +80,7 @@ def describe_lifts(graph: SupportGraph, order: Order | None, lifts: Sequence[Tak
         parts.append(cell_html(Section("", hint)))
     else:
         line = order_line(order, graph)
-        text = f"after view {view}: {line[0].upper()}{line[1:]}."
+        text = f"{asked}: {line[0].upper()}{line[1:]}."
         facts = [*told(order.steps), *([("Refused", order.refusal)] if order.refusal else [])]
         parts.append(cell_html(Section("Order", text, facts=facts)))
     return "".join(parts)
