@@ -247,12 +247,13 @@ def viewer(browser: Any) -> Iterator[tuple[str, Image.Image]]:
         page.wait()
         tab.wait_for_text("finished")
         yield "cleared", shot(tab)
-    with viewing(browser, "sample-recording", segmentation="auto") as (_, tab):
+    with viewing(browser, "sample-recording", segmentation="auto") as (page, tab):
         tab.page.get_by_text("image", exact=True).click()
         yield "recording", shot(tab)
         tab.page.set_viewport_size({"width": 1600, "height": 1000})
         yield "large", shot(tab)
         tab.page.set_viewport_size({"width": 390, "height": 844})
+        tab.open(page.url, resolution=1.0)
         yield "phone", shot(tab)
 
 
