@@ -510,3 +510,17 @@ def test_what_a_view_explains_already_is_not_fitted_again(monkeypatch):
     objects = sum(o.role == "object" for o in scene.graph.objects)
     assert before >= 4 * objects
     assert len(counts) - before < objects / 2
+
+
+def test_an_object_is_asked_about_by_its_id_or_its_name(views):
+    scene = Scene()
+    scene.update(replace(views[0], names={1: "crate", 2: "can"}))
+    crate, can = scene.graph["crate"].id, scene.graph["can"].id
+    assert [effect.object_id for effect in scene.predict_removal("crate")] == [can]
+    assert scene.explain("crate", "can") == scene.explain(crate, can)
+    assert scene.why("can").subject == (can,)
+    with pytest.raises(InputError, match=r"known objects: crate \(o1\), can \(o2\)"):
+        scene.removed("teapot")
+    scene.removed("can")
+    assert can not in scene.graph
+    assert [(change.kind, change.object_id) for change in scene.new_changes] == [("removed", can)]

@@ -142,11 +142,13 @@ class SupportGraph(Pictured):
     supports: tuple[Support, ...] = ()
     stability: dict[str, Stability] = field(default_factory=dict)
 
-    def __getitem__(self, object_id: str) -> SceneObject:
+    def __getitem__(self, word: str) -> SceneObject:
+        """The object with an id or a name."""
+        object_id = self.find_id(word)
         for candidate in self.objects:
             if candidate.id == object_id:
                 return candidate
-        raise KeyError(f"unknown object '{object_id}'; known objects: {', '.join(self)}")
+        raise KeyError(f"unknown object '{word}'; known objects: {', '.join(o.title for o in self.objects)}")
 
     def __contains__(self, object_id: object) -> bool:
         return any(o.id == object_id for o in self.objects)

@@ -181,22 +181,24 @@ class Scene(Pictured):
         """Explain why one object supports another, or why not, with numbers.
 
         Args:
-            supporter: Id of an object, such as `o1`.
-            supported: Id of an object.
+            supporter: Id or name of an object, such as `o1`.
+            supported: Id or name of an object.
         """
-        return explain(self.graph, supporter, supported, self.config.support)
+        graph = self.graph
+        return explain(graph, graph.find_id(supporter), graph.find_id(supported), self.config.support)
 
     def why(self, object_id: str, other: str | None = None) -> Reasons:
         """Say what an object's explanation costs, and what others would; or why two objects are two.
 
         Args:
-            object_id: Id of an object, such as `o3`.
-            other: Id of another one.
+            object_id: Id or name of an object, such as `o3`.
+            other: Id or name of another one.
 
         Raises:
             InputError: An object is unknown, or has no points, or both are the same.
         """
-        ids, labels = [object_id] if other is None else [object_id, other], list[int]()
+        words, labels = [object_id] if other is None else [object_id, other], list[int]()
+        ids = [self.graph.find_id(word) for word in words]
         for id_ in ids:
             label = self._label_of(self._object(id_).id)
             if label is None or label not in self._models.fits:
@@ -215,12 +217,12 @@ class Scene(Pictured):
         """Predict which objects move when one is removed, with probability and reason.
 
         Args:
-            object_id: Id of an object, such as `o3`.
+            object_id: Id or name of an object, such as `o3`.
 
         Raises:
             InputError: The object is unknown, or it is the support surface.
         """
-        return predict_removal(self.graph, object_id, self.config.support)
+        return predict_removal(self.graph, self.graph.find_id(object_id), self.config.support)
 
     def order(
         self,
@@ -321,8 +323,9 @@ class Scene(Pictured):
             InputError: The object is unknown, or it is the support surface.
         """
         self._finish()
-        self._forget(self._object(object_id))
-        self._reported("removed", object_id)
+        removed = self._object(object_id)
+        self._forget(removed)
+        self._reported("removed", removed.id)
         return self.graph
 
     def moved(self, object_id: str, T: Array) -> SupportGraph:
@@ -339,8 +342,9 @@ class Scene(Pictured):
             InputError: The object is unknown, it is the support surface, or T is not a rigid transform.
         """
         self._finish()
-        self._forget(self._object(object_id), transforms.as_rigid(T, "T"))
-        self._reported("moved", object_id)
+        moved = self._object(object_id)
+        self._forget(moved, transforms.as_rigid(T, "T"))
+        self._reported("moved", moved.id)
         return self.graph
 
     def added(self, shape: Shape, label: int | None = None) -> str:
@@ -381,15 +385,15 @@ class Scene(Pictured):
             log.warning(LEFT_OUT, error)
 
     def _object(self, object_id: str) -> SceneObject:
-        """The object with this id.
+        """The object with this id or name.
 
         Raises:
             InputError: The id is unknown, or it is the support surface.
         """
         for o in self.graph.objects:
-            if o.id == object_id and o.role == "object":
+            if o.id == self.graph.find_id(object_id) and o.role == "object":
                 return o
-        known = ", ".join(o.id for o in self.graph.objects if o.role == "object")
+        known = ", ".join(o.title for o in self.graph.objects if o.role == "object")
         raise InputError(object_id, "is not an object of the graph", f"known objects: {known or 'none'}")
 
     def _labels(self) -> set[int]:

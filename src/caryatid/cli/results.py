@@ -163,7 +163,7 @@ def find_order(command: Order) -> int:
     shown = table(f"Steps{describe_gripper(config)}", steps.columns, rows) if rows else ""
     refusal = f"{order.refusal}\n" if order.refusal else ""
     if config.gripper.kind != "none" and voxels is None:
-        command.output.say("a run does not store unseen space: only known shapes are in the gripper's way")
+        refusal += "Not checked: whether the gripper's path was seen to be free; a run does not store that.\n"
     command.output.result(order.to_json(), f"{command.run}: {order_line(order, graph)}\n", refusal, shown)
     return 0 if order.safe else NOT_SAFE
 

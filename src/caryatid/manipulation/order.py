@@ -130,7 +130,11 @@ def plan_order(
     goal = None if goal is None else graph.find_id(goal)
     rehearsal = _Rehearsal(graph, config or Config(), seed, threads, voxels, reachable)
     if goal is not None and goal not in rehearsal.ids:
-        raise GoalError(goal, "is not an object of the graph", f"known objects: {', '.join(rehearsal.ids)}")
+        raise GoalError(
+            goal,
+            "is not an object of the graph",
+            f"known objects: {', '.join(graph[i].title for i in rehearsal.ids)}",
+        )
     found: list[TakeStep] = []
     refusal = ""
     while len(found) != steps and (left := rehearsal.left()) and (goal is None or goal in left):
