@@ -162,7 +162,6 @@ def main(description: Path, settings: Path) -> None:
             print("T_world_gripper", np.round(take.grasp.T_world_gripper, 3).tolist())
             print("joints", arm.grasp(take.grasp.T_world_gripper))
     print(order.refusal or "the lift is safe")
-    assert f1 >= 0.95
 
 
 if __name__ == "__main__":
