@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -10,7 +11,7 @@ from typing import Any
 from caryatid_msgs.action import Explore
 from caryatid_msgs.msg import Decision, SupportGraph
 from caryatid_msgs.srv import Order, Refused, Removed
-from conftest import wait_for
+from conftest import TABLE, wait_for
 from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
@@ -20,9 +21,9 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
-from table import DEFAULTS
 from vision_msgs.msg import Detection3DArray
 
+DEFAULTS = runpy.run_path(str(TABLE))["DEFAULTS"]
 SERVICES = {"order": Order, "refused": Refused, "removed": Removed, "go_home": Trigger}
 
 

@@ -16,9 +16,11 @@ from typing import ClassVar
 import pytest
 import rclpy
 
-collect_ignore = ["stand_ins", "table.py"]
+collect_ignore = ["stand_ins"]
 
 HERE = Path(__file__).parent
+EXAMPLES = HERE.parents[1] / "examples"
+TABLE = EXAMPLES / "ros_table.py"
 NODE = "-c", "from caryatid_ros.node import main; main()"
 TOPICS = {
     "depth_topic": "/camera/depth",
@@ -42,8 +44,9 @@ class Process:
         for name, value in parameters.items():
             command += ["-p", f"{name}:={_yaml(value)}"]
         self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ
-        )
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            env=os.environ,
+        )  # fmt: skip
         self.command, self.lines = " ".join(command[1:]), list[str]()
         self.running.append(self)
         threading.Thread(target=self._read, daemon=True).start()
@@ -120,7 +123,7 @@ def domain(worker_id):
 @pytest.fixture(scope="session")
 def table(domain):
     """The table's process; `client.set_table` changes its parameters."""
-    process = Process(HERE / "table.py")
+    process = Process(TABLE)
     yield process
     process.stop()
 
@@ -182,7 +185,7 @@ def new_client(monkeypatch):
 
     number = int(os.environ["ROS_DOMAIN_ID"]) + 5
     monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    table = Process(HERE / "table.py")
+    table = Process(TABLE)
 
     @contextmanager
     def make():

@@ -1,10 +1,10 @@
 """A simulated table as a ROS 2 node: publishes the images of a depth camera, its camera info and tf.
 
-    python tests/ros/table.py --ros-args -p scene:=tower
+    python examples/ros_table.py --ros-args -p scene:=tower
 
 Its parameters may be changed while it runs. The camera moves to the newest `decision` (or stays), or with
-`carried` is where tf says. Its service `go_home` moves the camera to its first pose, and says whether another
-node is listening.
+`carried` is where tf says; until tf knows that, there are no images. Its service `go_home` moves the camera
+to its first pose, and says whether another node is listening.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ import io
 import time
 from array import array
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import PIL.Image
 import rclpy
 from caryatid_msgs.msg import Decision
 from geometry_msgs.msg import PoseStamped, TransformStamped
+from numpy.typing import NDArray
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
@@ -32,10 +34,11 @@ from tf2_ros import Buffer, TransformException, TransformListener
 
 from caryatid.benchmark.episodes import open_scene
 from caryatid.config import Config, SensorConfig
+from caryatid.geometry.transforms import Array
 from caryatid.simulation.setup import make_simulation
 from caryatid_ros.messages import matrix_of
 
-DEFAULTS = {
+DEFAULTS: dict[str, Any] = {
     "scene": "tower",
     "width": 320,
     "focal": 262.5,
@@ -69,10 +72,10 @@ class Table(Node):
         simulation = make_simulation(scene, config, noise="none", seed=0)
         self.camera, self.pose = simulation.camera, simulation.robot.T_world_camera
         self._home = self.pose
-        self._way: tuple[float, np.ndarray, np.ndarray] | None = None
+        self._way: tuple[float, Array, Array] | None = None
         self._buffer = Buffer()
         self._listener = TransformListener(self._buffer, self)
-        self._drawn: tuple[bytes, tuple] | None = None
+        self._drawn: tuple[bytes, tuple[Any, ...]] | None = None
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._depth_topic = self.create_publisher(Image, "/camera/depth", qos_profile_sensor_data)
         self._colour_topic = self.create_publisher(Image, "/camera/colour", qos_profile_sensor_data)
@@ -89,7 +92,7 @@ class Table(Node):
         self.create_timer(1.0 / self._value("rate"), self._publish)
         self.create_timer(0.01, self._move)
 
-    def _value(self, name: str):
+    def _value(self, name: str) -> Any:
         return self.get_parameter(name).value
 
     def _decide(self, message: Decision) -> None:
@@ -97,7 +100,7 @@ class Table(Node):
         if self._value("follow"):
             self._go(message.camera.pose)
 
-    def _go(self, pose) -> None:
+    def _go(self, pose: Any) -> None:
         q, p, end = pose.orientation, pose.position, np.eye(4)
         end[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
         end[:3, 3] = p.x, p.y, p.z
@@ -110,12 +113,7 @@ class Table(Node):
 
     def _move(self) -> None:
         carried = self._value("carried")
-        if carried:
-            with suppress(TransformException):
-                names = self._value("world"), self._value("frame")
-                found = self._buffer.lookup_transform(*names, Time()).transform
-                self.pose = matrix_of(found.rotation, found.translation, "camera")
-        elif self._way is not None:
+        if self._way is not None and not carried:
             since, start, end = self._way
             share = min(1.0, (time.monotonic() - since) / max(self._value("motion_time"), 1e-3))
             turn = Slerp([0.0, 1.0], Rotation.from_matrix([start[:3, :3], end[:3, :3]]))
@@ -137,6 +135,13 @@ class Table(Node):
             self._tf_topic.publish(TFMessage(transforms=[message]))
 
     def _publish(self) -> None:
+        if self._value("carried"):
+            try:
+                names = self._value("world"), self._value("frame")
+                found = self._buffer.lookup_transform(*names, Time()).transform
+            except TransformException:
+                return
+            self.pose = matrix_of(found.rotation, found.translation, "camera")
         if self._drawn is None or self._drawn[0] != self.pose.tobytes():
             view = self.camera.capture(self.pose)
             depth = view.depth
@@ -172,7 +177,7 @@ class Table(Node):
             roi.x_offset, roi.y_offset, roi.width, roi.height = self._value("roi")
             self._info_topic.publish(info)
 
-    def _image(self, pixels: np.ndarray, encoding: str, stamp: int) -> Image:
+    def _image(self, pixels: NDArray[Any], encoding: str, stamp: int) -> Image:
         message = Image(height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
         message.header.frame_id = self._value("frame")
