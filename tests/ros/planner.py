@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from control_msgs.action import GripperCommand
+from control_msgs.action import GripperCommand, ParallelGripperCommand
 from geometry_msgs.msg import TransformStamped
 from moveit_msgs.action import ExecuteTrajectory, MoveGroup
 from moveit_msgs.msg import (
@@ -87,7 +87,7 @@ class Arm(Planner):
         done: What was done, in order: a verb, and where the hand or the gripper is then, or with what object.
     """
 
-    def __init__(self, node, T_map_base, T_base_hand, T_hand_camera) -> None:
+    def __init__(self, node, T_map_base, T_base_hand, T_hand_camera, gripper=GripperCommand) -> None:
         super().__init__(node)
         self.T_base_hand, self.asked, self.refused, self.done = T_base_hand, 0, (), []
         self.matrix.entry_names = [BASE, HAND]
@@ -100,7 +100,7 @@ class Arm(Planner):
         self._actions = [
             ActionServer(node, MoveGroup, "/move_action", self._move),
             ActionServer(node, ExecuteTrajectory, "/execute_trajectory", self._follow),
-            ActionServer(node, GripperCommand, "/panda_hand_controller/gripper_cmd", self._grip),
+            ActionServer(node, gripper, "/panda_hand_controller/gripper_cmd", self._grip),
         ]
         self._services = [
             node.create_service(ApplyPlanningScene, "/apply_planning_scene", self._answer_diff),
@@ -175,9 +175,14 @@ class Arm(Planner):
         return result
 
     def _grip(self, handle):
-        self.done.append(("grip", handle.request.command.position))
+        command = handle.request.command
         handle.succeed()
-        return GripperCommand.Result(position=handle.request.command.position, reached_goal=True)
+        if isinstance(handle.request, ParallelGripperCommand.Goal):
+            (position,) = command.position
+            self.done.append(("grip", position))
+            return ParallelGripperCommand.Result(state=command, reached_goal=True)
+        self.done.append(("grip", command.position))
+        return GripperCommand.Result(position=command.position, reached_goal=True)
 
     def _answer_diff(self, request, response):
         attached = request.scene.robot_state.attached_collision_objects
