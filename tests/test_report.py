@@ -225,7 +225,8 @@ def test_an_unsafe_or_unknown_lift_is_said_to_be_so():
     unsafe = Order((step,), "no safe order: lifting o1 disturbs o2")
     assert tell_lifts([], unsafe, make_graph()).split("\n") == [
         "No lift is safe. The least risky is to lift o1: nothing else moves with probability 0.38.",
-        "Disturbed o2 with probability 0.60 in 24 rehearsals; no safe order: lifting o1 disturbs o2.",
+        "Disturbed o2 with probability 0.60 in 24 rehearsals; no grasp was checked, because no gripper was "
+        "given; no safe order: lifting o1 disturbs o2.",
     ]
     for unknown in (Order((), "no object can be grasped"), "no object can be grasped"):
         assert tell_lifts([], unknown, make_graph()) == "No safe lift is known.\nNo object can be grasped."

@@ -587,10 +587,14 @@ def read_command(arguments: Sequence[str]) -> Any:
     if list(arguments[:1]) in ([], ["help"]):
         arguments = [*arguments[1:], "--help"]
     name, *words = arguments
-    try:
-        if name in COMMANDS:
-            return _parse(COMMANDS[name], f"caryatid {name}", words)
+    if name.startswith("-"):
         return _parse(_any_command(), "caryatid", arguments).command
+    if name not in COMMANDS:
+        meant = "".join(f" Did you mean {word}?" for word in get_close_matches(name, COMMANDS, 1))
+        sys.stderr.write(f"error: there is no command '{name}'.{meant} `caryatid --help` lists all.\n")
+        raise SystemExit(2)
+    try:
+        return _parse(COMMANDS[name], f"caryatid {name}", words)
     except SystemExit as end:
         if end.code:
             _suggest(name, words)
@@ -605,10 +609,9 @@ def _parse(kind: Any, program: str, arguments: Sequence[str]) -> Any:
 
 
 def _suggest(name: str, words: Sequence[str]) -> None:
-    """Print the command or the value of an option that a mistyped one resembles."""
-    pairs = pairwise(words) if name in COMMANDS else [("", name)]
-    choices = _choices(COMMANDS[name]) if name in COMMANDS else {"": list(COMMANDS)}
-    for option, word in pairs:
+    """Print the value of an option that a mistyped one resembles."""
+    choices = _choices(COMMANDS[name])
+    for option, word in pairwise(words):
         known = choices.get(option, []) if not word.startswith("-") else []
         if word not in known and (meant := get_close_matches(word, known, 1)):
             sys.stderr.write(f"Did you mean {meant[0]}?\n")

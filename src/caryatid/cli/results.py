@@ -252,7 +252,8 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
 def _plan_lift(run: Run, config: Config) -> orders.Order | str:
     """Plan what to lift first after a run; or say why it is unknown, or nothing if no object is left."""
     options, graph = run.record["options"], run.graph
-    goal = options["goal"] if options.get("goal") in graph else None
+    wanted = graph.find_id(options.get("goal") or "")
+    goal = wanted if wanted in graph else None
     hands, seed = options.get("hands", 1), run.record["seed"]
     if len(graph) == len(graph.support_surfaces):
         return ""

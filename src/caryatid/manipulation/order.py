@@ -78,7 +78,7 @@ class Order(Pictured):
 
     def __repr__(self) -> str:
         taken = ", ".join(s.object_id + "".join(f" (hold {i})" for i in s.hold) for s in self.steps)
-        return f"Order({taken}; {self.refusal or 'safe'})"
+        return f"Order({taken or 'no lift'}; {self.refusal or 'safe'})"
 
     def to_json(self) -> dict[str, Any]:
         """The steps, whether they are safe, and why not; `probability` is that of the whole order."""

@@ -124,12 +124,14 @@ def order_line(order: Order, graph: SupportGraph) -> str:
     """Say whether an order is safe, how probably all of it is, and what to remove."""
     if not order.steps:
         return "no lift is possible"
-    head = "no safe order; the least risky one"
-    if all(step.safe for step in order.steps):
-        head = "safe order" if order.safe else "safe as far as it goes"
     held = ("".join(f" (hold {graph[i].title})" for i in s.hold) for s in order.steps)
-    taken = ", ".join(graph[s.object_id].title + hold for s, hold in zip(order.steps, held, strict=True))
-    return f"{head} (nothing else moves: {1.0 - order.risk:.0%}): {taken}"
+    taken = [graph[s.object_id].title + hold for s, hold in zip(order.steps, held, strict=True)]
+    safe = next((k for k, step in enumerate(order.steps) if not step.safe), len(taken))
+    head = "safe order" if order.safe else "safe as far as it goes"
+    if safe < len(taken):
+        first = f"safe at first: {', '.join(taken[:safe])}; then" if safe else "no lift is safe;"
+        head, taken = f"{first} the least risky", taken[safe:]
+    return f"{head} (nothing else moves: {1.0 - order.risk:.0%}): {', '.join(taken)}"
 
 
 def order_table(order: Order, *, brief: bool = False, graph: SupportGraph | None = None) -> Table:
@@ -166,7 +168,8 @@ def tell_lifts(lifts: Sequence[Mapping[str, Any]], order: Order | str, graph: Su
     name = graph[step.object_id].title + f" while the other hand holds {hold}" * bool(hold)
     what = f"Lift {name} {'next' if done else 'first'}"
     text += what if step.safe else f"No lift is safe. The least risky is to lift {name}"
-    why = sentence("; ".join(filter(None, (step.why, order.refusal))))
+    grasp = "" if step.grasp else "no grasp was checked, because no gripper was given"
+    why = sentence("; ".join(filter(None, (step.why, grasp, order.refusal))))
     return f"{text}: nothing else moves with probability {1.0 - step.risk:.2f}.\n{why}"
 
 
