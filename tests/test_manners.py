@@ -315,7 +315,7 @@ def said_on(monkeypatch):
 COLOUR = re.compile(r"\x1b\[(?:\d+;)*[349]\d")
 
 
-@pytest.mark.parametrize("words", ["explore nowhere --out", "explore tower --fusion k --out", "juggle"])
+@pytest.mark.parametrize("words", ["explore nowhere --out", "explore tower --fusion k --out", "order --x"])
 def test_errors_are_coloured_on_a_terminal_unless_no_color_is_set(words, said_on, tmp_path):
     spelled = [*words.split(), *([tmp_path / "run"] if words.endswith("--out") else [])]
     assert COLOUR.search(said_on(spelled, out=True, err=True)[1]) or "nowhere" in words
