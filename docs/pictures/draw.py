@@ -249,6 +249,7 @@ def viewer(browser: Any) -> Iterator[tuple[str, Image.Image]]:
         yield "cleared", shot(tab)
     with viewing(browser, "sample-recording", segmentation="auto") as (page, tab):
         tab.page.get_by_text("image", exact=True).click()
+        page._kind.value = "segments and shapes"
         yield "recording", shot(tab)
         tab.page.set_viewport_size({"width": 1600, "height": 1000})
         yield "large", shot(tab)

@@ -334,7 +334,8 @@ class Page:
         camera.position = centre + 3.2 * reach * direction(azimuth, 0.55)  # From 3.2 radii, all objects fit.
 
     def _greet(self, client: Any) -> None:
-        """Move back the eye of a window higher than wide, such as a phone's, until all objects fit."""
+        """Draw for a new browser; one higher than wide, such as a phone, sees all objects from farther."""
+        self.redraw()
         if self.steps and client.camera.aspect < 1.0:
             self._look_from("start", client.camera)
 
@@ -386,8 +387,9 @@ class Page:
         texts = [
             (self._summary, describe_view(step, f1, count, before)), (self._graph, drawn),
             (self._lifts, describe_lifts(steps[-1].graph, order, lifts, f"after view {number}; {asked}")),
-            (self._image, draw_view(steps[-1], self._kind.value)),
         ]  # fmt: skip
+        if self.server.get_clients():  # Nobody else sees it, and it costs most.
+            texts.append((self._image, draw_view(steps[-1], self._kind.value)))
         if any(f1 is not None for f1 in scores):
             values = [np.nan if f1 is None else f1 for f1 in scores]
             chart = Figure("", draw_chart("F1 after each view", "F1", {"F1": values}, top=1.0))
