@@ -290,7 +290,9 @@ class TestGrasps:
     def test_unseen_space_and_the_arm_forbid_grasps(self):
         block = box((0.0, 0.0, TOP + 0.03), (0.06, 0.06, 0.06))
         unseen = VoxelMap.around((0.0, 0.0, TOP), CONFIG.voxels)
-        assert find_grasp(block, {}, JAW, 0.3, voxels=unseen).why == "the space around it was not seen empty"
+        assert find_grasp(block, {}, JAW, 0.3, voxels=unseen).why.startswith(
+            "at most 0% of the gripper's way was seen"
+        )
         seen = replace(unseen, passes=np.ones_like(unseen.passes))
         assert find_grasp(block, {}, JAW, 0.3, voxels=seen).seen_free == 1.0
         tilted = find_grasp(block, {}, JAW, 0.3, reachable=lambda T: T[:, 2, 2] > -0.9)
@@ -407,14 +409,25 @@ class TestCommands:
             assert step.keys() == {"object", "hold", "safe", "risk", "probability", "why"}
             assert (step["safe"], step["hold"], step["probability"]) == (True, [], 1.0 - step["risk"])
         assert run_command("order", kept_run, "--goal", "o2", *QUICK) == 0
-        assert capsys.readouterr().out == f"{kept_run}: safe order (nothing else moves: 83%): o2\n"
-        assert run_command("order", kept_run, "--gripper", "parallel", *QUICK) == 3
+        assert capsys.readouterr().out.split("\n") == [
+            "Safe order (nothing else moves: 83%): o2.",
+            "Not checked: whether a gripper can grasp the objects, because none is given.",
+            "",
+        ]
+        blind = "--set", "gripper.seen=0"
+        assert run_command("order", kept_run, "--gripper", "parallel", *blind, *QUICK) == 3
         table = capsys.readouterr().out
-        assert "safe as far as it goes (nothing else moves: 83%): o2\n" in table
+        assert "Safe as far as it goes (nothing else moves: 83%): o2.\n" in table
         assert "1 of 2 objects can be removed; o1 cannot be" in table
         assert "gripper, opening 140 mm" in table
-        assert re.search(r"│ 1 │ o2 +│ – +│ 0.83 ", table)
+        assert re.search(r"│ 1 +│ o2 +│ – +│ 0.83 ", table)
         assert max(len(line) for line in table.splitlines() if line[0] in "┏┃│") <= 80
+
+    def test_a_gripper_moves_only_where_the_run_saw_free_space(self, kept_run, tmp_path, capsys):
+        assert run_command("order", kept_run, "--gripper", "parallel", *QUICK) == 3
+        assert "o2 cannot be grasped: at most" in capsys.readouterr().out
+        blind = run_command("order", kept_run / "graph.json", "--gripper", "parallel", *QUICK)
+        assert (blind, "Not checked: whether the gripper's path" in capsys.readouterr().out) == (3, True)
 
     @pytest.mark.parametrize(
         ("words", "status", "said"),
@@ -440,7 +453,7 @@ class TestCommands:
             known = np.array([0.0, -4.0, -4.0]), 1.0, 0.0, "gripper", T_world_base
             write_reachability(tmp_path / "reach.npz", ReachabilityMap(everything, *known))
             reach = () if x is None else ("--reach", tmp_path / "reach.npz")
-            words = ("--json", "--gripper", "parallel", *reach)
+            words = ("--json", "--gripper", "parallel", "--set", "gripper.seen=0", *reach)
             assert run_command("order", kept_run, *words, *QUICK) == 3, "o1 is too wide"
             orders.append(json.loads(capsys.readouterr().out))
         anywhere, around, beside = orders
@@ -492,7 +505,7 @@ class TestCommands:
         assert all(step["ok"] and step["disturbed"] == [] for step in document["steps"])
         assert all(0.0 <= step["grasp"]["seen_free"] < 0.99 for step in document["steps"])
         assert (document["success"], document["views"]) == (bool(taken), len(run.views))
-        assert ("was not seen empty" if not taken else "o1 is removed") in document["stop"]
+        assert ("seen to be free, less than 99%" if not taken else "o1 is removed") in document["stop"]
         assert {o.id for o in run.graph.objects} == {"o0", "o1", "o2"} - {i for i, _ in taken}
 
     def test_it_keeps_looking_while_no_lift_is_safe(self, scene_file, tmp_path, capsys):

@@ -65,7 +65,7 @@ def shown(scene, steps, views):
         "cloud of nothing": Cloud(np.empty((0, 3)), np.empty((0, 3))),
         "decision": steps[0].decision,
         "decision without points": Decision(pose, 3, 0.5, 0.1, 0.4, "because"),
-        "order": Order((safe, TakeStep("o1", ("o3",), False, 0.25, "it disturbs o3")), "no safe order"),
+        "order": Order((safe, TakeStep("o1", ("o3",), False, 0.25, "it disturbs o3")), "no safe order", 0.25),
         "order of nothing": Order(()),
     }
 
@@ -118,7 +118,7 @@ def test_the_cell_shows_the_facts(shown, scene, steps):
         "box": "100 × 200 × 0 mm",
         "cylinder": "⌀ 80 × 200 mm",
         "sphere": "⌀ 100 mm",
-        "order": "not safe",
+        "order": "then the least risky (nothing else moves: 75%): o1 (hold o3)",
         "view": "160 × 120 px",
         "view of depth": "unknown pose",
         "scene of nothing": "no views yet",

@@ -46,7 +46,7 @@ from caryatid.viz.graph_drawing import arrange, draw_graph, widths
 from caryatid.viz.pictures import picture_svg
 from caryatid.viz.report import Figure, Report, make_report, print_pdf, render_html
 from caryatid.viz.scene_3d import scene_3d_html, support_ends
-from caryatid.viz.tables import census, changes, sides_to_see, tell_lifts
+from caryatid.viz.tables import census, changes, describe_order, describe_removed, sides_to_see
 
 SMALL = ReportConfig(image_width=160)
 TOP = 0.7
@@ -125,7 +125,7 @@ REASONS = (
     Reasons(("o7",), (Option("a sphere", 12.0, 0.0, 18.0),)),
 )
 LIFTED = {"object": "o9", "body": "lid", "held": ["o7"], "disturbed": ["can"]}
-SAFE = Order((TakeStep("o2", ("o1", "o7"), True, 0.02, "disturbed nothing in 24 rehearsals"),))
+SAFE = Order((TakeStep("o2", ("o1", "o7"), True, 0.02, "disturbed nothing in 24 rehearsals"),), risk=0.02)
 TAKEN = Change("removed", "o9", 1, "empty <space> where it stood")
 STOOD = RobotPose(Posture(np.array([-1.2, 0.0, 0.0]), 1.6, 0.0, -0.5), at(-1.2, 0.0, 1.6), 0.35, False)
 
@@ -148,7 +148,8 @@ def report(make_step) -> Report:
             good(0.9, wrong=[("o0", "o2")], missing=[("o1", "o7"), ("o0", "lid")], unfound=["lid"]),
         ],
         strip=[Figure("1: o2", draw_graph(make_graph()), "Nothing else moved")],
-        answer=tell_lifts([LIFTED], SAFE, make_graph()),
+        answer="\n".join([*describe_removed([LIFTED]), *describe_order(SAFE, make_graph())]),
+        order=SAFE,
         config=SMALL,
     )
 
@@ -221,18 +222,19 @@ def test_all_of_a_run_is_in_its_page(report, html):
 
 
 def test_an_unsafe_or_unknown_lift_is_said_to_be_so():
-    step = TakeStep("o1", (), False, 0.62, "disturbed o2 with probability 0.60 in 24 rehearsals")
-    unsafe = Order((step,), "no safe order: lifting o1 disturbs o2")
-    assert tell_lifts([], unsafe, make_graph()).split("\n") == [
-        "No lift is safe. The least risky is to lift o1: nothing else moves with probability 0.38.",
-        "Disturbed o2 with probability 0.60 in 24 rehearsals; no grasp was checked, because no gripper was "
-        "given; no safe order: lifting o1 disturbs o2.",
+    step = TakeStep("o1", ("o2",), False, 0.62, "disturbed o2 with probability 0.60 in 24 rehearsals")
+    unsafe = Order((step,), "no safe order: lifting o1 disturbs o2", 0.62)
+    assert describe_order(unsafe, make_graph()) == [
+        "No lift is safe; the least risky (nothing else moves: 38%): o1 (hold o2).",
+        "No safe order: lifting o1 disturbs o2.",
     ]
-    for unknown in (Order((), "no object can be grasped"), "no object can be grasped"):
-        assert tell_lifts([], unknown, make_graph()) == "No safe lift is known.\nNo object can be grasped."
-    assert tell_lifts([LIFTED | {"disturbed": []}], "", make_graph()).endswith(
-        "(o7 held); nothing else moved. "
-    )
+    assert describe_order(Order((), "no object can be grasped"), make_graph()) == [
+        "No lift is possible.",
+        "No object can be grasped.",
+    ]
+    assert describe_removed([LIFTED | {"disturbed": []}]) == [
+        "Removed, in this order: o9 (o7 held); nothing else moved."
+    ]
 
 
 def test_ids_lead_to_the_rows_of_their_objects(html):
@@ -471,7 +473,7 @@ def test_the_command_writes_page_and_print_of_a_run(run, tmp_path, capsys, brows
     assert (run / "report.html").read_text() == before
     after = Page(before)
     assert "Removed, in this order: o2; nothing else moved." in after.text
-    assert "Lift o1 next: nothing else moves with probability 0." in after.text
+    assert "Safe order (nothing else moves: " in after.text
     assert "Nothing else moved" in after.text
     assert "View 2" in "".join(sheet.extract_text() for sheet in PdfReader(tmp_path / "run.pdf").pages)
 

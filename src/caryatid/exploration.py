@@ -30,6 +30,7 @@ from caryatid.runtime.parallel import check_budget, one_blas_thread
 from caryatid.scene import Scene, Stopwatch
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Camera, Cloud, View
+from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.support.relations import Removal
 
 log, progress = logging.getLogger(__name__), logging.getLogger("caryatid.progress")
@@ -85,6 +86,7 @@ class Step(Pictured):
         lift: The object removed after this view, or None.
         removal: With a goal that was found: what moves when it is removed; otherwise None.
         reasons: Why each object has its shape; empty before the last step.
+        voxels: Which space was seen free; None before the last step.
     """
 
     index: int
@@ -106,6 +108,7 @@ class Step(Pictured):
     lift: TakeStep | None = None
     removal: Removal | None = None
     reasons: tuple[Reasons, ...] = ()
+    voxels: VoxelMap | None = None
 
     def __repr__(self) -> str:
         following = f"stop: {self.stop}" if self.decision is None else f"next: {self.decision.why}"
@@ -330,6 +333,10 @@ class Explorer:
             self.step = replace(step, removal=removal)
         return self._newest()
 
+    def conclude(self, step: Step) -> Step:
+        """Add to the last step what only it tells: why each object has its shape, and free space."""
+        return replace(step, reasons=self.scene.reasons(), voxels=self.scene.voxels)
+
     def choose(self, chosen: Decision | int) -> Step:
         """Choose another view instead of the planner's, and return the newest step with it and its waypoints.
 
@@ -473,7 +480,7 @@ def explore(
             for late in explorer.finish():
                 yield late
                 step = replace(late, stop=step.stop)
-            step = replace(step, reasons=explorer.scene.reasons())
+            step = explorer.conclude(step)
             lost = goal is not None and step.graph.find_id(goal) not in step.graph
             yield replace(step, stop=f"{step.stop}; {goal} was not found") if lost else step
             return

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import NoneType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -82,18 +82,29 @@ def is_name(source: str) -> bool:
     return is_builtin(source) or find_sample(source) != Path(source)
 
 
-def read_model(path: Path) -> tuple[SupportGraph, VoxelMap | None]:
-    """Read the graph of a run, a session or a graph.json; of a session, also what it knows of space.
+class Model(NamedTuple):
+    """What is known of a scene: the graph, settings, seed, and which space was seen free, or None."""
+
+    graph: SupportGraph
+    config: Config
+    seed: int
+    voxels: VoxelMap | None
+
+
+def read_model(path: Path) -> Model:
+    """Read the model of a run, a session, or a graph.json, which has no more than its graph.
 
     Raises:
         InputError: It is none of these, or a file in it is missing or broken.
     """
     if path.is_file():
-        return read_graph(path), None
+        return Model(read_graph(path), Config(), 0, None)
     if not is_session(path):
-        return read_run(path).graph, None
+        run = read_run(path)
+        return Model(run.graph, read_config(run), run.record["seed"], run.views[-1].load_step().voxels)
     with Session.open(path, read_only=True) as session:
-        return session.graph, session.scene.voxels
+        scene = session.scene
+        return Model(session.graph, scene.config, scene.seed, scene.voxels)
 
 
 def read_scene(path: Path) -> Scene:
@@ -323,7 +334,7 @@ def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:
     for left, frame in zip(range(len(recording))[::-1], recording.frames, strict=True):
         try:
             for step in explorer.looks(frame.load()):
-                yield step if left else replace(step, reasons=explorer.scene.reasons())
+                yield step if left else explorer.conclude(step)
         except NoSurfaceError as error:
             if not left:
                 raise

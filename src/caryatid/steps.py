@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PositiveInt
 
-from caryatid.config import Config
+from caryatid.config import Config, VoxelConfig
 from caryatid.config.settings import changed_settings
 from caryatid.errors import GoalError, InputError
 from caryatid.exploration import RobotPose, Step
@@ -35,6 +35,7 @@ from caryatid.robots import Posture
 from caryatid.runtime import LIBRARIES
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.support.relations import Effect, Removal
 
 FORMAT: Final = "caryatid/run"
@@ -46,7 +47,7 @@ OWN_FILES: Final = re.compile(
 """Files of a run folder."""
 PARTS = (
     View, Cloud, ViewSphere, Candidates, Decision, PointOfInterest, Posture, RobotPose, Change, TakeStep,
-    Grasp, Removal, Effect, Reasons, Option,
+    Grasp, Removal, Effect, Reasons, Option, VoxelMap, VoxelConfig,
 )  # fmt: skip
 """Classes that a step is made of."""
 

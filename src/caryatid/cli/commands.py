@@ -245,16 +245,19 @@ class Order(options.LiftingCommand, options.ComputingCommand, work="results:find
       caryatid order run --risk 0.2
     """
 
-    settings: options.Modelling = options.Modelling()
+    settings: options.Settings = options.Settings()
     run: options.RunPath
-    """Run folder, session, or graph.json."""
+    """Run folder, session, or graph.json; settings and seed are those of the run, if not given."""
+    seed: Annotated[options.Natural | None, options.shown(default="that of the run")] = None
+    """Random seed of the rehearsals."""
 
 
-class Report(options.Command, work="results:redraw_report"):
-    """Write the report of a run again, optionally also as a PDF.
+class Report(options.LiftingCommand, options.Command, work="results:redraw_report"):
+    """Write the report of a run again, optionally for a gripper, and also as a PDF.
 
     Usage examples:
       caryatid report run
+      caryatid report run --gripper franka
       caryatid report run --pdf report.pdf
     """
 

@@ -33,6 +33,7 @@ from caryatid.cli.commands import (
     Report,
     Why,
 )  # fmt: skip
+from caryatid.cli.options import LiftingCommand, Settings
 from caryatid.cli.output import kept, table
 from caryatid.config import Config
 from caryatid.errors import InputError, needs_extra
@@ -51,7 +52,16 @@ from caryatid.sources import kind_of, open_run, read_model, read_scene
 from caryatid.steps import Run, read_config, read_steps
 from caryatid.viz.check_report import SHOWN, make_check_report
 from caryatid.viz.report import find_chromium, make_report, print_pdf, read_lift, render_html
-from caryatid.viz.tables import Table, census, count_of, describe, order_line, order_table, tell_lifts
+from caryatid.viz.tables import (
+    Table,
+    census,
+    count_of,
+    describe,
+    describe_order,
+    describe_removed,
+    order_table,
+    sentence,
+)
 
 
 def check_views(command: Check) -> int:
@@ -150,33 +160,25 @@ def print_scores(command: Evaluate) -> None:
 
 
 def find_order(command: Order) -> int:
-    config = command.settings.read(*command.lift_settings())
-    graph, voxels = read_model(command.run)
-    reachable, seed = command.reachable(config), command.settings.seed
+    graph, known, seed, voxels = read_model(command.run)
+    config = command.settings.read(*command.lift_settings(), base=known)
+    reachable, seed = command.reachable(config), seed if command.seed is None else command.seed
     with command.output.working("rehearsing"):
         order = orders.plan_order(
             graph, config, goal=command.goal, hands=command.hands, seed=seed, threads=cores(),
             voxels=voxels, reachable=reachable,
         )  # fmt: skip
-    steps = order_table(order, brief=True, graph=graph)
+    steps = order_table(order, graph, brief=True)
     rows = [[entry.text for entry in row] for row in steps.rows]
-    shown = table(f"Steps{describe_gripper(config)}", steps.columns, rows) if rows else ""
-    refusal = f"{order.refusal}\n" if order.refusal else ""
-    if config.gripper.kind != "none" and voxels is None:
-        refusal += "Not checked: whether the gripper's path was seen to be free; a run does not store that.\n"
-    command.output.result(order.to_json(), f"{command.run}: {order_line(order, graph)}\n", refusal, shown)
+    shown = table(steps.heading, steps.columns, rows) if rows else ""
+    text = "".join(f"{line}\n" for line in describe_order(order, graph))
+    command.output.result(order.to_json(), text, shown)
     return 0 if order.safe else NOT_SAFE
 
 
-def describe_gripper(config: Config) -> str:
-    """Name the gripper of the lifts and its opening; empty without one."""
-    gripper = config.gripper
-    jaw = f", opening {1e3 * gripper.opening:.0f} mm" if gripper.kind == "parallel" else ""
-    return "" if gripper.kind == "none" else f" with a {gripper.kind} gripper{jaw}"
-
-
 def redraw_report(command: Report) -> None:
-    for path in write_report(command.run, command.pdf):
+    paths, _ = write_report(command.run, command.pdf, command)
+    for path in paths:
         command.output.say(f"report: {path}")
     command.output.result({"html": command.run / "report.html", "pdf": command.pdf}, "")
 
@@ -192,14 +194,14 @@ def export_model(command: Export) -> None:
         command.output.say(f"{out}: {count_of(len(run.views), 'view')}")
         return
     format_ = format_of(out, command.format)
-    graph, _ = read_model(command.run)
+    graph = read_model(command.run).graph
     export_graph(graph, out, config.export)
     command.output.result({"file": str(out), "format": format_}, "")
     command.output.say(f"{out}: {format_}, {census(graph)}")
 
 
 def describe_model(command: Describe) -> None:
-    text = describe(read_model(command.run)[0])
+    text = describe(read_model(command.run).graph)
     command.output.result({"text": text}, text)
 
 
@@ -217,8 +219,15 @@ def tell_reasons(command: Why) -> None:
     command.output.result(reasons.to_json(), table(title, heads, rows, figures=True), notes)
 
 
-def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
-    """Draw the report of a run or session; write its report.html, and a PDF if asked for; return their paths.
+def write_report(
+    folder: Path, pdf: Path | None = None, asked: LiftingCommand | None = None
+) -> tuple[list[Path], list[str]]:
+    """Draw the report of a run or session; write its report.html, and a PDF if asked for.
+
+    The order in it is for the goal, hands and gripper asked for, or else for those of the run.
+
+    Returns:
+        The paths of the files, and what was removed and what to remove, a sentence each.
 
     Raises:
         InputError: It is neither a run nor a session, a file in it is broken, or a file cannot be written;
@@ -226,15 +235,25 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
     """
     with open_run(folder) as run:
         config, record = read_config(run), run.record
+        if asked is not None:
+            config = Settings().read(*asked.lift_settings(), base=config)
         settings = {"source": record["source"], "seed": record["seed"]} | record["options"]
         settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
         made_by = f"caryatid {record.get('versions', {}).get('caryatid', '')}".rstrip()
         about = [record.get("conditions"), made_by, record.get("date", "")[:16].replace("T", " ")]
+        order, answer = None, describe_removed(record.get("lifts", ()))
+        if len(run.graph) > len(run.graph.support_surfaces):
+            try:
+                order = _plan_order(run, config, asked)
+                answer += describe_order(order, run.graph)
+            except InputError as error:
+                answer += [f"No lift was rehearsed. {sentence(str(error))}"]
         report = make_report(
             Path(record["source"]).name,
             read_steps(run),
             about=" · ".join(filter(None, about)),
-            answer=tell_lifts(record.get("lifts", ()), _plan_lift(run, config), run.graph),
+            answer="\n".join(answer),
+            order=order,
             settings=settings,
             scores=record.get("scores", ()),
             strip=[read_lift(path) for path in sorted((folder / "lifts").glob("*.png"))],
@@ -246,21 +265,20 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
     files[folder / "report.html"] = page.encode()
     for path, content in files.items():
         write_file(path, content)
-    return list(files)
+    return list(files), answer
 
 
-def _plan_lift(run: Run, config: Config) -> orders.Order | str:
-    """Plan what to lift first after a run; or say why it is unknown, or nothing if no object is left."""
-    options, graph = run.record["options"], run.graph
-    wanted = graph.find_id(options.get("goal") or "")
+def _plan_order(run: Run, config: Config, asked: LiftingCommand | None) -> orders.Order:
+    """Plan what to remove after a run, as asked for, or as its command was; ignore a goal that is unknown."""
+    options, graph, seed = run.record["options"], run.graph, run.record["seed"]
+    wanted, hands, reachable = graph.find_id(options.get("goal") or ""), options.get("hands", 1), None
     goal = wanted if wanted in graph else None
-    hands, seed = options.get("hands", 1), run.record["seed"]
-    if len(graph) == len(graph.support_surfaces):
-        return ""
-    try:
-        return orders.plan_order(graph, config, goal=goal, hands=hands, steps=1, seed=seed, threads=cores())
-    except InputError as error:
-        return str(error)
+    if asked is not None:
+        goal, hands, reachable = asked.goal or goal, max(asked.hands, hands), asked.reachable(config)
+    return orders.plan_order(
+        graph, config, goal=goal, hands=hands, seed=seed, threads=cores(), reachable=reachable,
+        voxels=run.views[-1].load_step().voxels,
+    )  # fmt: skip
 
 
 def compare_methods(command: Benchmark) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from caryatid.cli import NOT_SAFE
 from caryatid.cli.commands import VIEWER_PORT, Clear, Demo, Explore, Extract, View
 from caryatid.cli.output import Output, kept, profile, table
-from caryatid.cli.results import describe_gripper, write_report
+from caryatid.cli.results import write_report
 from caryatid.config import Config
 from caryatid.errors import GoalError, InputError
 from caryatid.evaluation.oracle import planner_for
@@ -156,9 +156,9 @@ def clear_table(command: Clear) -> int:
             for number, lift in enumerate(taken, start=1)
         ]  # fmt: skip
         outcome = f"{', '.join(harmed)} disturbed" if harmed else "nothing disturbed"
-        name = f"{source.name}{describe_gripper(config)}"
+        name = f"{source.name} {config.gripper.title}".strip()
         title = f"{name}: {last.stop}; {count_of(last.index + 1, 'view')}, {outcome}"
-        output.result(document, table(title, ("", "remove", "body", "hold", "disturbed", "reason"), rows))
+        output.result(document, table(title, ("step", "remove", "body", "hold", "disturbed", "reason"), rows))
         return 0 if success else NOT_SAFE
 
 
@@ -290,9 +290,11 @@ def _finish(
 ) -> None:
     """Write the report and print the result."""
     output = command.output
-    _draw_report(command)
+    answer = _draw_report(command)
     _check_found(goal, last)
     output.say(f"{name}: {census(last.graph)} after {count_of(len(writer.steps), 'view')}")
+    for line in answer:
+        output.say(line)
     output.say(f"run: {command.out}" if command.no_report else f"report: {command.out / 'report.html'}")
     program, out = "caryatid" if which("caryatid") else sys.argv[0], quote(str(command.out))
     output.say(f"next: {program} order {out}, or {program} view {out}")
@@ -336,9 +338,10 @@ def _record(
     return last
 
 
-def _draw_report(command: Explore | Extract | Clear) -> None:
-    """Draw the report of a finished run folder, unless it is not wanted."""
+def _draw_report(command: Explore | Extract | Clear) -> list[str]:
+    """Draw the report of a finished run folder, unless it is not wanted; return its answer."""
     what = f"the run is kept in {command.out}; `caryatid report {command.out}` writes the report"
     if not command.no_report:
         with kept(what), command.output.working("drawing the report"):
-            write_report(command.out)
+            return write_report(command.out)[1]
+    return []

@@ -686,6 +686,12 @@ class GripperConfig:
     seen: Share = 0.95
     """Minimum share of the space along the approach that was seen to be free [1]; the rest is noise."""
 
+    @property
+    def title(self) -> str:
+        """What lifts, in words, such as `with a parallel gripper, opening 80 mm`; empty without a gripper."""
+        jaw = f", opening {1e3 * self.opening:.0f} mm" if self.kind == "parallel" else ""
+        return "" if self.kind == "none" else f"with a {self.kind} gripper{jaw}"
+
 
 Gripper = GripperConfig
 """`GripperConfig`, as `caryatid` exports it."""

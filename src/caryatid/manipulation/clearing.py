@@ -94,7 +94,8 @@ def clear(
         step = replace(explorer.step, lift=lift, removal=None)
         if reason is not None:
             # No further view shows what is left.
-            step = replace(step, graph=explorer.scene.graph, candidates=None, decision=None, stop=reason)
+            last = replace(step, graph=explorer.scene.graph, candidates=None, decision=None, stop=reason)
+            step = explorer.conclude(last)
         explorer.step = step
         yield step
 

@@ -8,7 +8,7 @@ both ways, and approach through space that was seen empty.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +50,7 @@ def find_grasp(
     friction: float,
     *,
     voxels: VoxelMap | None = None,
+    removed: Sequence[Shape] = (),
     reachable: Reachable | None = None,
 ) -> Grasp | Blocked:
     """Find the best grasp of an object that nothing obstructs, or say why there is none.
@@ -62,6 +63,7 @@ def find_grasp(
         gripper: The gripper.
         friction: Coefficient of friction between fingers and object [1].
         voxels: What was seen empty; None = only known shapes obstruct.
+        removed: Shapes that were there when the space was seen, and are there no more.
         reachable: Which gripper poses (N, 4, 4), in the world frame, the arm reaches; None = all. The arm has
             to reach the grasp, the start of its approach, and the end of the lift.
 
@@ -89,7 +91,7 @@ def find_grasp(
     arm = np.linalg.norm(poses[:, :3, 3] - shape.centre_of_mass, axis=1)
     lean = gripper.length * (1.0 + poses[:, 2, 2])  # how far the hand leans over, as a lever
     near = {i: o for i, o in others.items() if _near(o, shape, gripper)}
-    fewest, unseen = None, False
+    fewest, most = tuple[str, ...](), -1.0
     for k in np.argsort(arm + lean, kind="stable").tolist():
         swept, risen = (
             transforms.transform(poses[k], _volume(gripper, widths[k], travel))
@@ -101,24 +103,27 @@ def find_grasp(
         if (shape.signed_distance(swept) < 0.0).any():
             continue
         by = tuple(i for i, o in near.items() if (o.signed_distance(path) < gripper.clearance).any())
-        if by:
-            fewest = by if fewest is None or len(by) < len(fewest) else fewest
+        if by and fewest and len(by) >= len(fewest):
             continue
         free = None
         if voxels is not None:
             # Next to known surfaces, their shapes decide: readings fill the voxels there.
-            away = np.min([o.signed_distance(swept) for o in (shape, *near.values())], axis=0)
+            known = (shape, *near.values(), *removed)
+            away = np.min([o.signed_distance(swept) for o in known], axis=0)
             asked = swept[away > np.sqrt(3.0) * voxels.config.size]
             free = float((voxels.state_at(asked) == FREE).mean()) if len(asked) else 1.0
             if free < gripper.seen:
-                unseen = True
+                most = max(most, free)
                 continue
-        return Grasp(poses[k] @ turn, float(widths[k]), gripper.travel, free)
-    if unseen:
-        return Blocked((), "the space around it was not seen empty")
-    return Blocked(
-        fewest or (), f"{', '.join(fewest)} in the way" if fewest else "it is too large for the hand"
-    )
+        if not by:
+            return Grasp(poses[k] @ turn, float(widths[k]), gripper.travel, free)
+        fewest = by
+    if fewest:
+        return Blocked(fewest, f"{', '.join(fewest)} in the way")
+    if most >= 0.0:
+        seen = f"at most {100.0 * most // 1.0:.0f}% of the gripper's way was seen to be free"
+        return Blocked((), f"{seen}, less than {gripper.seen:.0%}")
+    return Blocked((), "it is too large for the hand")
 
 
 def turn_of(gripper: GripperConfig) -> Array:

@@ -65,11 +65,15 @@ class Order(Pictured):
         refusal: Why no order is safe, and which objects block each other; empty for a safe order.
         risk: Probability that any of the lifts moves another object, from the share of the rehearsals of all
             lifts in which one did [1].
+        unchecked: What was not checked, because it was not given; empty if all was.
+        gripper: What lifts, as `Gripper.title`; empty if every object counts as graspable.
     """
 
     steps: tuple[TakeStep, ...]
     refusal: str = ""
     risk: float = 0.0
+    unchecked: str = ""
+    gripper: str = ""
 
     @property
     def safe(self) -> bool:
@@ -82,8 +86,9 @@ class Order(Pictured):
 
     def to_json(self) -> dict[str, Any]:
         """The steps, whether they are safe, and why not; `probability` is that of the whole order."""
-        known = {"steps": [step.to_json() for step in self.steps], "probability": 1.0 - self.risk}
-        return known | {"safe": self.safe, "refusal": self.refusal or None}
+        notes = {"refusal": self.refusal or None, "unchecked": self.unchecked or None}
+        steps = [step.to_json() for step in self.steps]
+        return {"steps": steps, "probability": 1.0 - self.risk, "safe": self.safe, **notes}
 
 
 def plan_order(
@@ -128,7 +133,8 @@ def plan_order(
     if threads < 1:
         raise InputError("threads", f"{threads} is less than 1", "give the number of parallel rehearsals")
     goal = None if goal is None else graph.find_id(goal)
-    rehearsal = _Rehearsal(graph, config or Config(), seed, threads, voxels, reachable)
+    config = config or Config()
+    rehearsal = _Rehearsal(graph, config, seed, threads, voxels, reachable)
     if goal is not None and goal not in rehearsal.ids:
         raise GoalError(
             goal,
@@ -149,7 +155,12 @@ def plan_order(
             refusal = "; ".join([_refusal(trial, tried), *_out_of_grasp(rehearsal, wanted)])
         found.append(_step(rehearsal, trial, left))
         rehearsal.take(trial)
-    return Order(tuple(found), refusal, rehearsal.risk)
+    gripper, unchecked = config.gripper.title, ""
+    if not gripper:
+        unchecked = "whether a gripper can grasp the objects, because none is given"
+    elif voxels is None:
+        unchecked = "whether the gripper's path was seen to be free, because it is not known which space was"
+    return Order(tuple(found), refusal, rehearsal.risk, unchecked, gripper)
 
 
 def _in_turn(rehearsal: _Rehearsal) -> list[str]:
@@ -374,7 +385,8 @@ class _Rehearsal:
             gone = {trial.object_id for trial in self._taken} | {object_id}
             others = {o.id: o.shape for o in self.graph.objects if o.id not in gone}
             gripper, friction = self._config.gripper, self._config.support.friction[0]
-            known: Any = {"voxels": self._voxels, "reachable": self._reachable}
+            removed = [self.graph[trial.object_id].shape for trial in self._taken]
+            known: Any = {"voxels": self._voxels, "removed": removed, "reachable": self._reachable}
             shape = self.graph[object_id].shape
             self._grasps[object_id] = find_grasp(shape, others, gripper, friction, **known)
         return self._grasps[object_id]

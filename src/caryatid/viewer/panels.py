@@ -19,7 +19,7 @@ from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.notebook import cell_html
 from caryatid.viz.pictures import Picture, element, raster
 from caryatid.viz.report import Figure, Section
-from caryatid.viz.tables import census, happenings, object_table, order_line, support_table
+from caryatid.viz.tables import census, describe_order, happenings, object_table, order_table, support_table
 
 WIDTH = 380
 """Of pictures in a panel [px]."""
@@ -68,27 +68,24 @@ def describe_object(
 
 def describe_lifts(graph: SupportGraph, order: Order | None, lifts: Sequence[TakeStep], asked: str) -> str:
     """Describe an order, if there is one, and for what it was asked; and the lifts made so far."""
-
-    def told(steps: Sequence[TakeStep]) -> list[tuple[str, str]]:
-        return [(f"{number}. {s.object_id}", _describe_lift(s)) for number, s in enumerate(steps, start=1)]
-
     parts = []
     if lifts:
-        parts.append(cell_html(Section("Removed so far", facts=told(lifts))))
+        parts.append(cell_html(Section("Removed so far", facts=_list_lifts(Order(tuple(lifts)), graph))))
     if order is None:
         hint = "Plan an order to see what to lift first, and how surely nothing else moves."
         parts.append(cell_html(Section("", hint)))
     else:
-        line = order_line(order, graph)
-        text = f"{asked}: {line[0].upper()}{line[1:]}."
-        facts = [*told(order.steps), *([("Refused", order.refusal)] if order.refusal else [])]
-        parts.append(cell_html(Section("Order", text, facts=facts)))
+        text = " ".join(describe_order(order, graph))
+        parts.append(cell_html(Section(f"Order, {asked}", text, facts=_list_lifts(order, graph))))
     return "".join(parts)
 
 
-def _describe_lift(step: TakeStep) -> str:
-    held = f"hold {', '.join(step.hold)}; " if step.hold else ""
-    return f"{1.0 - step.risk:.0%}{'' if step.safe else ', too low'}; {held}{step.why}"
+def _list_lifts(order: Order, graph: SupportGraph) -> list[tuple[str, str]]:
+    """List the steps of an order: number and object, and how safe it is to lift it."""
+    rows = [[entry.text for entry in row] for row in order_table(order, graph).rows]
+    return [
+        (f"{row[0]}. {row[1]}", f"{row[3]}; {f'hold {row[2]}; ' * (row[2] != '–')}{row[4]}") for row in rows
+    ]
 
 
 def draw_linked_graph(graph: SupportGraph, chosen: str, address: str) -> str:

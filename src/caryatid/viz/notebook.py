@@ -25,6 +25,7 @@ from caryatid.viz.report import Figure, Section, sensor_azimuth, template
 from caryatid.viz.tables import (
     census,
     count_of,
+    describe_order,
     object_table,
     order_table,
     point_table,
@@ -90,9 +91,7 @@ def _cell_of(shown: object) -> Section:
             facts += [(name, f"{score:.3f}") for name, score in scores.items()]
             return Section("Decision", shown.why, facts=facts, tables=[point_table(shown)])
         case Order():
-            lead = f"{count_of(len(shown.steps), 'object')} to remove, {'safe' if shown.safe else 'not safe'}"
-            facts = [("refused", shown.refusal)] * bool(shown.refusal)
-            return Section("Order", lead, facts=facts, tables=[order_table(shown)])
+            return Section("Order", " ".join(describe_order(shown)), tables=[order_table(shown)])
     raise TypeError(f"a {type(shown).__name__} cannot be shown in a notebook")
 
 

@@ -41,6 +41,7 @@ from caryatid.viz.tables import (
     doubts,
     noticed,
     object_table,
+    order_table,
     point_table,
     reason_table,
     sentence,
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     import jinja2
 
     from caryatid.exploration import Step
+    from caryatid.manipulation.order import Order
 
 
 SUPPORTS = (
@@ -137,6 +139,7 @@ def make_report(
     *,
     about: str = "",
     answer: str = "",
+    order: Order | None = None,
     settings: Mapping[str, object] | None = None,
     scores: Sequence[Mapping[str, Any]] = (),
     strip: Sequence[Figure] = (),
@@ -149,7 +152,8 @@ def make_report(
         title: Heading of the report.
         steps: Steps that `explore` or `extract` yields; at least one.
         about: Conditions, version and date of the run.
-        answer: What was removed, what may be lifted first, how sure that is; the first line is the largest.
+        answer: What was removed, what to remove, how safe that is; the first line is the largest.
+        order: The order in which to remove objects, with its grasps.
         settings: Names and values of the run's settings.
         scores: Values of the `Score` after each view by name; empty without ground truth.
         strip: Pictures of the lifts, in order.
@@ -188,7 +192,7 @@ def make_report(
     if scores and len(scores) != len(seen):
         raise ValueError(f"{len(scores)} scores for {len(seen)} views")
     text = f"{answer} {census(last.graph)} after {count_of(len(seen), 'view')}.".strip()
-    sections = [*_answer(last, shown, text, scores[-1] if scores else None, width)]
+    sections = [*_answer(last, shown, text, order, scores[-1] if scores else None, width)]
     facts = [("Warning", sentence(warning)) for warning in warnings]
     facts += happened
     facts += [("Finished", sentence(last.stop))] if last.stop else []
@@ -209,9 +213,9 @@ def make_report(
 
 
 def _answer(
-    step: Step, shown: Step, text: str, score: Mapping[str, Any] | None, width: int
+    step: Step, shown: Step, text: str, order: Order | None, score: Mapping[str, Any] | None, width: int
 ) -> Iterator[Section]:
-    """The final graph beside the view of the step that shows most objects, in 3D, and what is doubtful."""
+    """The final graph beside the view of the step that shows most objects, the order, doubts, and in 3D."""
     graph, truth, facts = step.graph, {"wrong": (), "missing": ()} | dict(score or {}), []
     if step.removal is not None:
         facts.append((f"Without {step.removal.object_id}", f"{step.removal}."))
@@ -235,6 +239,8 @@ def _answer(
         caption = f"View {shown.index + 1} with the final shapes; objects with pale names are not visible."
         seen = Figure("The objects", draw_image(shown.view, shown.labels, graph, width), caption)
     yield Section("Answer", text, [supports, seen] if supports.share == 1 else [seen, supports], facts)
+    if order is not None and order.steps:
+        yield Section("Order", tables=[order_table(order, graph)])
     doubtful = [(lead, why) for lead, why, _ in doubts(graph)]
     text = f"Nothing: all supports and objects have a probability above {DOUBTFUL}, and all shapes fit."
     if any(s.probability is None for s in graph.supports):

@@ -120,21 +120,26 @@ def point_table(decision: Decision | None) -> Table:
     return Table.of("Points of interest", ("objects", "saliency", "reason"), rows)
 
 
-def order_line(order: Order, graph: SupportGraph) -> str:
-    """Say whether an order is safe, how probably all of it is, and what to remove."""
-    if not order.steps:
-        return "no lift is possible"
-    held = ("".join(f" (hold {graph[i].title})" for i in s.hold) for s in order.steps)
-    taken = [graph[s.object_id].title + hold for s, hold in zip(order.steps, held, strict=True)]
-    safe = next((k for k, step in enumerate(order.steps) if not step.safe), len(taken))
-    head = "safe order" if order.safe else "safe as far as it goes"
-    if safe < len(taken):
-        first = f"safe at first: {', '.join(taken[:safe])}; then" if safe else "no lift is safe;"
-        head, taken = f"{first} the least risky", taken[safe:]
-    return f"{head} (nothing else moves: {1.0 - order.risk:.0%}): {', '.join(taken)}"
+def describe_order(order: Order, graph: SupportGraph | None = None) -> list[str]:
+    """Say what to remove in which order and how safe that is, what is refused, and what was not checked.
+
+    Objects have the names of a graph, if it is given.
+    """
+    names = {} if graph is None else {o.id: o.title for o in graph.objects}
+    held = (f" (hold {' and '.join(names.get(i, i) for i in s.hold)})" * bool(s.hold) for s in order.steps)
+    listed = [names.get(s.object_id, s.object_id) + hold for s, hold in zip(order.steps, held, strict=True)]
+    safe = next((k for k, step in enumerate(order.steps) if not step.safe), len(listed))
+    lead = "safe order" if order.safe else "safe as far as it goes"
+    if safe < len(listed):
+        first = f"safe at first: {', '.join(listed[:safe])}; then" if safe else "no lift is safe;"
+        lead, listed = f"{first} the least risky", listed[safe:]
+    line = f"{lead} (nothing else moves: {1.0 - order.risk:.0%}): {', '.join(listed)}"
+    unchecked = f"not checked: {order.unchecked}" * bool(order.unchecked)
+    texts = (line if order.steps else "no lift is possible", order.refusal, unchecked)
+    return [sentence(text) for text in texts if text]
 
 
-def order_table(order: Order, *, brief: bool = False, graph: SupportGraph | None = None) -> Table:
+def order_table(order: Order, graph: SupportGraph | None = None, *, brief: bool = False) -> Table:
     """Make the table of the steps of an order, with the names of a graph; if brief, of those not alike.
 
     Alike are safe steps with the lowest risk, without a hold or a grasp.
@@ -152,25 +157,16 @@ def order_table(order: Order, *, brief: bool = False, graph: SupportGraph | None
         for number, step in enumerate(order.steps, 1)
         if not brief or step.hold or step.grasp or not step.safe or step.risk > least
     )
-    return Table.of("Steps", ("", "remove", "hold", "probability", "reason"), rows)
+    columns = ("step", "remove", "hold", "probability", "reason")
+    return Table.of(f"Steps {order.gripper}".strip(), columns, rows)
 
 
-def tell_lifts(lifts: Sequence[Mapping[str, Any]], order: Order | str, graph: SupportGraph) -> str:
-    """Say what was removed (`lifts` of run.json), and what may be lifted first, how surely; and why."""
+def describe_removed(lifts: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say what was removed (`lifts` of run.json), and what moved with it; nothing if there were no lifts."""
     done = [lift for lift in lifts if lift["body"] is not None]
     names = (x["object"] + "".join(f" ({held} held)" for held in x["held"]) for x in done)
     moved = "; ".join(f"{', '.join(x['disturbed'])} moved with {x['object']}" for x in done if x["disturbed"])
-    text = f"Removed, in this order: {', '.join(names)}; {moved or 'nothing else moved'}. " if done else ""
-    if isinstance(order, str) or not order.steps:
-        why = order if isinstance(order, str) else order.refusal
-        return text + f"No safe lift is known.\n{sentence(why)}" * bool(why)
-    step, hold = order.steps[0], " and ".join(graph[i].title for i in order.steps[0].hold)
-    name = graph[step.object_id].title + f" while the other hand holds {hold}" * bool(hold)
-    what = f"Lift {name} {'next' if done else 'first'}"
-    text += what if step.safe else f"No lift is safe. The least risky is to lift {name}"
-    grasp = "" if step.grasp else "no grasp was checked, because no gripper was given"
-    why = sentence("; ".join(filter(None, (step.why, grasp, order.refusal))))
-    return f"{text}: nothing else moves with probability {1.0 - step.risk:.2f}.\n{why}"
+    return [f"Removed, in this order: {', '.join(names)}; {moved or 'nothing else moved'}."] if done else []
 
 
 def size_of(shape: Shape, uncertainty: Uncertainty | None = None) -> str:
@@ -268,8 +264,9 @@ def describe(graph: SupportGraph) -> str:
 
 
 def sentence(text: str) -> str:
-    """Begin with a capital and end with a full stop."""
-    return f"{text[:1].upper()}{text[1:].rstrip('.')}." if text else ""
+    """Begin with a capital, unless with an id, and end with a full stop."""
+    first = text[:1] if text[1:2].isdigit() else text[:1].upper()
+    return f"{first}{text[1:].rstrip('.')}." if text else ""
 
 
 def noticed(before: Step | None, step: Step) -> list[Change]:
