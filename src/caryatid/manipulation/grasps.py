@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -157,8 +158,9 @@ def _approaches(closing: Array, gripper: GripperConfig) -> Iterator[Array]:
     if np.linalg.norm(downward) < 1e-6:
         return
     downward = transforms.unit(downward)
+    sideways = np.cross(closing, downward)
     for turn in TURNS:
-        approach = np.cos(turn) * downward + np.sin(turn) * np.cross(closing, downward)
+        approach = np.cos(turn) * downward + np.sin(turn) * sideways
         if -approach[2] >= np.cos(np.radians(gripper.tilt)) - 1e-9:
             yield approach
 
@@ -204,6 +206,7 @@ def gripper_boxes(gripper: GripperConfig, width: float) -> list[tuple[Array, Arr
     return [(np.array(low), np.array(high)) for low, high in boxes]
 
 
+@lru_cache(maxsize=256)
 def _volume(gripper: GripperConfig, width: float, travel: float) -> Array:
     """Points (N, 3) [m] all over a gripper that moves along its approach, in its frame at the grasp."""
     points = []
