@@ -12,7 +12,6 @@ import numpy as np
 import pydot
 import pytest
 import trimesh
-import yaml
 import yourdfpy
 from conftest import run_command
 from scipy import ndimage
@@ -322,39 +321,6 @@ def test_what_supports_an_object_may_touch_it_and_the_robot_keeps_its_own_entrie
     assert matrix["default_entry_names"] == ["octomap"]
 
 
-def test_a_curobo_world_has_the_shapes_of_the_model(tmp_path, with_solid):
-    moved = replace(with_solid.objects[3], shape=Sphere(at(5e-5, -0.2, 0.78), 0.03))
-    graph = replace(with_solid, objects=(*with_solid.objects[:3], moved, *with_solid.objects[4:]))
-    export_graph(graph, tmp_path / "world.yml")
-    world = yaml.safe_load((tmp_path / "world.yml").read_text())
-    fields = {
-        "cuboid": {"dims"}, "cylinder": {"radius", "height"}, "sphere": {"radius"},
-        "mesh": {"vertices", "faces"},
-    }  # fmt: skip
-    assert world.keys() == fields.keys()
-    made = {}
-    for kind, obstacles in world.items():
-        for name, known in obstacles.items():
-            assert known.keys() == fields[kind] | {"pose", "color"}
-            assert [type(v) for v in known["pose"]] == [float] * 7
-            turn = Rotation.from_quat(known["pose"][3:], scalar_first=True).as_matrix()
-            T = transforms.rigid(turn, known["pose"][:3])
-            match kind:
-                case "cuboid":
-                    made[name] = Box(T, np.array(known["dims"]))
-                case "cylinder":
-                    made[name] = Cylinder(T, known["radius"], known["height"])
-                case "sphere":
-                    made[name] = Sphere(T, known["radius"])
-                case "mesh":
-                    assert trimesh.Trimesh(known["vertices"], known["faces"]).is_watertight
-                    made[name] = Solid.from_size(T, {"parts": [known["vertices"]]})
-    expected = {o.id: o.shape for o in graph.objects[:-1]}
-    expected |= {f"o16_part_{n}": part for n, part in enumerate(graph["o16"].shape.parts, start=1)}
-    assert made.keys() == expected.keys()
-    assert all(same_shape(shape, made[name].outline()) for name, shape in expected.items())
-
-
 def test_a_pddl_problem_has_the_supports(tmp_path, with_solid):
     parse_problem = pytest.importorskip("pddl").parse_problem
     export_graph(with_solid, tmp_path / "problem.pddl")
@@ -474,7 +440,6 @@ def test_any_name_of_an_object_stays_one_name(tmp_path, graph, name):
         "s.usda",
         "s.sparkdsg",
         "s.json",
-        "s.yml",
         "s.pddl",
     ],
 )
@@ -502,7 +467,7 @@ def test_a_graph_file_alone_can_be_exported_and_settings_count(tmp_path, graph):
     [
         (["--out", "model.step"], "the suffix is not that of any format"),
         (["--format", "mjcf", "--out", "graph.json"], "the suffix is not that of mjcf; use .xml"),
-        (["--format", "curobo", "--out", "graph.json"], "use .yml, .yaml"),
+        (["--format", "usd", "--out", "graph.json"], "use .usda, .usd"),
         (["--out", "folder.urdf"], "is a directory"),
     ],
 )

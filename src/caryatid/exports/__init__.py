@@ -11,7 +11,7 @@ from caryatid.config import ExportConfig, ExportFormat
 from caryatid.errors import InputError
 from caryatid.exports.graphs import to_dot, to_dsg, to_graphml, to_pddl
 from caryatid.exports.models import to_gltf, to_mjcf, to_urdf, to_usd
-from caryatid.exports.motion import planning_scene, to_curobo
+from caryatid.exports.motion import planning_scene
 from caryatid.graph import SupportGraph
 from caryatid.io.json_files import json_text, read_json
 from caryatid.io.staging import write_file
@@ -34,7 +34,6 @@ FORMATS: Final[dict[ExportFormat, Format]] = {
         (".glb", ".gltf"), lambda graph, config, end: to_gltf(graph, config, binary=end == ".glb")
     ),
     "moveit": Format((".json",), lambda graph, config, _: json_text(planning_scene(graph, config.frame))),
-    "curobo": Format((".yml", ".yaml"), lambda graph, config, _: to_curobo(graph)),
     "pddl": Format((".pddl",), lambda graph, config, _: to_pddl(graph)),
     "graphml": Format((".graphml",), lambda graph, config, _: to_graphml(graph)),
     "dsg": Format((".sparkdsg",), lambda graph, config, _: to_dsg(graph)),

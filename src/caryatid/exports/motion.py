@@ -1,8 +1,7 @@
-"""Worlds for motion planners: MoveIt's planning scene and cuRobo's world."""
+"""A scene model for motion planners: MoveIt's planning scene."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,9 +13,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Cylinder, Primitives, Shape, Sphere
 from caryatid.geometry.solids import Solid
 from caryatid.graph import SceneObject, SupportGraph
-from caryatid.io.json_files import json_text
 from caryatid.sensing.voxel_map import UNKNOWN, VoxelMap
-from caryatid.viz.colours import rgba
 
 BOX, SPHERE, CYLINDER = 1, 2, 3
 """Types of shape_msgs/SolidPrimitive."""
@@ -165,26 +162,3 @@ def _geometry(shape: Shape) -> dict[str, Any]:
 
 def _xyz(x: float, y: float, z: float) -> dict[str, float]:
     return {"x": x, "y": y, "z": z}
-
-
-def to_curobo(graph: SupportGraph) -> str:
-    """A world file of cuRobo: cuboids, cylinders, spheres, and a mesh for each convex part of a solid."""
-    world: dict[str, dict[str, Any]] = {}
-    for item in graph.objects:
-        shape, turn = item.shape, Rotation.from_matrix(item.shape.T_world_object[:3, :3])
-        known: dict[str, Any] = {"color": rgba(item.label)}
-        known["pose"] = [*item.centre_world, *turn.as_quat(canonical=True, scalar_first=True)]
-        match shape:
-            case Solid(polytopes=parts):
-                # One mesh of all parts would have faces inside, where cuRobo takes inside for outside.
-                for number, part in enumerate(parts, start=1):
-                    mesh = {"vertices": part.vertices, "faces": part.triangles}
-                    world.setdefault("mesh", {})[f"{item.id}_part_{number}"] = known | mesh
-            case Cylinder(radius=radius, height=height):
-                world.setdefault("cylinder", {})[item.id] = known | {"radius": radius, "height": height}
-            case Sphere(radius=radius):
-                world.setdefault("sphere", {})[item.id] = known | {"radius": radius}
-            case _:
-                world.setdefault("cuboid", {})[item.id] = known | {"dims": shape.extents}
-    # JSON is YAML, but for PyYAML, a number with an exponent and no decimal point is text.
-    return re.sub(r'^(\s*(?:"\w+": )?-?\d+)e', r"\1.0e", json_text(world), flags=re.MULTILINE)
