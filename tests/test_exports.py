@@ -321,18 +321,6 @@ def test_what_supports_an_object_may_touch_it_and_the_robot_keeps_its_own_entrie
     assert matrix["default_entry_names"] == ["octomap"]
 
 
-def test_a_pddl_problem_has_the_supports(tmp_path, with_solid):
-    parse_problem = pytest.importorskip("pddl").parse_problem
-    export_graph(with_solid, tmp_path / "problem.pddl")
-    problem = parse_problem(tmp_path / "problem.pddl")
-    assert {str(o) for o in problem.objects} == {"o1", "o2", "o3", "o15", "o16"}
-    assert {str(fact) for fact in problem.init} == {
-        "(on-table o1)", "(on o2 o1)", "(on o16 o1)",
-        "(clear o2)", "(clear o15)", "(clear o16)", "(arm-empty)",
-    }  # fmt: skip
-    assert "(on o16 o1) ; by o1, bottom-up, probability 0.80" in (tmp_path / "problem.pddl").read_text()
-
-
 # Viewers
 
 
@@ -440,7 +428,6 @@ def test_any_name_of_an_object_stays_one_name(tmp_path, graph, name):
         "s.usda",
         "s.sparkdsg",
         "s.json",
-        "s.pddl",
     ],
 )
 def test_the_name_says_the_format_and_the_same_model_gives_the_same_bytes(tmp_path, kept_run, name, capsys):
@@ -510,8 +497,4 @@ def test_an_impossible_export_ends_in_one_line(tmp_path, graph, capsys):
     twice = replace(graph, objects=(graph.objects[0], replace(graph.objects[1], id="table")), supports=())
     with pytest.raises(InputError, match="MuJoCo rejects it"):
         export_graph(twice, tmp_path / "s.xml")
-    for ids in (("o 1", "o2"), ("O1", "o1"), ("1", "2")):
-        renamed = [replace(o, id=id_) for o, id_ in zip(graph.objects[1:3], ids, strict=True)]
-        with pytest.raises(InputError, match="PDDL rejects the id"):
-            export_graph(replace(graph, objects=tuple(renamed), supports=()), tmp_path / "s.pddl")
     assert list(tmp_path.iterdir()) == []

@@ -1,9 +1,7 @@
-"""The support graph for other programs: GraphML, DOT, PDDL and spark_dsg."""
+"""The support graph for other programs: GraphML, DOT and spark_dsg."""
 
 from __future__ import annotations
 
-import re
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -62,36 +60,6 @@ def to_dot(graph: SupportGraph) -> str:
         ends = " -> ".join(_quoted(name) for name in support.pair)
         lines.append(f"  {ends} [{_listed(attributes)}];")
     return "\n".join([*lines, "}"]) + "\n"
-
-
-def to_pddl(graph: SupportGraph) -> str:
-    """A problem of the domain `blocksworld` of the planning competitions of 2023, without a goal.
-
-    An object is clear if it supports nothing. It is on all that support it from below or from the side, and
-    on the table if one of these is a support surface.
-
-    Raises:
-        InputError: PDDL rejects the id of an object, or does not tell two apart.
-    """
-    surfaces = {o.id for o in graph.support_surfaces}
-    names = [o.id for o in graph.objects if o.role == "object"]
-    for name, times in Counter(name.lower() for name in names).items():
-        if times > 1 or not re.fullmatch(r"[a-z][a-z0-9_-]*", name):
-            remedy = (
-                "rename objects in graph.json: a letter, then letters, digits, - and _; case does not count"
-            )
-            raise InputError("the scene model", f"PDDL rejects the id '{name}'", remedy)
-    facts = []
-    for s in graph.supports:
-        if s.kind != "top-down":
-            known = (
-                f"on-table {s.supported}" if s.supporter in surfaces else f"on {s.supported} {s.supporter}"
-            )
-            facts.append(f"({known}) ; by {s.supporter}, {s.kind}, probability {s.belief:.2f}")
-    holding = {s.supporter for s in graph.supports}
-    facts += [f"(clear {name})" for name in names if name not in holding]
-    lines = ["(:domain blocksworld)", f"(:objects {' '.join(names)})", "(:init", *facts, "(arm-empty))"]
-    return "\n  ".join(["(define (problem caryatid)", *lines, "(:goal (and)))"]) + "\n"
 
 
 def to_dsg(graph: SupportGraph) -> bytes:
