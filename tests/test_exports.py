@@ -372,31 +372,6 @@ def test_dot_is_the_graph(tmp_path, graph):
     assert read.get_node('"o3"')[0].get("fillcolor") == f'"{object_colour(3)}"'
 
 
-def test_a_scene_graph_of_spark_dsg_has_objects_and_supports(tmp_path, with_solid):
-    spark_dsg = pytest.importorskip("spark_dsg", reason="spark-dsg is not installed")
-    held = replace(with_solid, supports=(Support("o16", "o1", "top-down"), *with_solid.supports))
-    export_graph(held, tmp_path / "graph.sparkdsg")
-    read = spark_dsg.DynamicSceneGraph.load(tmp_path / "graph.sparkdsg")
-    nodes = {n.attributes.metadata.get()["id"]: n for n in read.get_layer(spark_dsg.DsgLayers.OBJECTS).nodes}
-    assert nodes.keys() == set(with_solid)
-    for item in with_solid.objects:
-        known = nodes[item.id].attributes
-        box = known.bounding_box
-        assert np.allclose(known.position, item.centre_world)
-        assert np.allclose(box.dimensions, item.shape.extents, atol=1e-3)
-        assert np.allclose(box.world_P_center, item.centre_world, atol=1e-3)
-        assert np.allclose(box.world_R_center, item.shape.T_world_object[:3, :3], atol=1e-5)
-        assert "#" + bytes(known.color[:3]).hex() == object_colour(item.label)
-    ids = {node.id.value: name for name, node in nodes.items()}
-    edges = {(ids[e.source], ids[e.target]): e.info for e in read.edges}
-    assert edges.keys() == {s.pair for s in with_solid.supports}
-    assert edges["o1", "o16"].weight == pytest.approx(0.8)
-    assert edges["o1", "o2"].metadata.get() == {"kind": "lean"}
-    same = replace(with_solid, objects=tuple(replace(o, label=1) for o in with_solid.objects))
-    with pytest.raises(InputError, match="two objects have the label 1"):
-        export_graph(same, tmp_path / "same.sparkdsg")
-
-
 @pytest.mark.parametrize("name", ['say "hi" -> b; c', "back\\slash", "<b>&amp;</b>", "two\nlines Öl"])
 def test_any_name_of_an_object_stays_one_name(tmp_path, graph, name):
     objects = tuple(replace(o, id=name) if o.id == "o15" else o for o in graph.objects)
@@ -426,12 +401,11 @@ def test_any_name_of_an_object_stays_one_name(tmp_path, graph, name):
         "s.graphml",
         "s.gv",
         "s.usda",
-        "s.sparkdsg",
         "s.json",
     ],
 )
 def test_the_name_says_the_format_and_the_same_model_gives_the_same_bytes(tmp_path, kept_run, name, capsys):
-    pytest.importorskip({"s.usda": "pxr", "s.sparkdsg": "spark_dsg"}.get(name, "caryatid"))
+    pytest.importorskip({"s.usda": "pxr"}.get(name, "caryatid"))
     contents = set()
     for _ in range(2):
         assert run_command("export", kept_run, "--out", tmp_path / name, "--json") == 0

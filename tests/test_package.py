@@ -130,7 +130,6 @@ MODULES = {
     "phone": ["av", "lzfse"],
     "ros": ["rosbags"],
     "usd": ["pxr"],
-    "dsg": ["spark_dsg"],
     "rerun": ["rerun"],
     "foxglove": ["foxglove"],
     "learn": ["gymnasium"],
@@ -181,7 +180,6 @@ WORDS = {
     "phone": "import {folder}/scan --out {folder}/phone",
     "ros": "import {folder}/pour.bag --depth /d --info /i --out {folder}/pour",
     "usd": "export {run} --out {folder}/scene.usda",
-    "dsg": "export {run} --out {folder}/scene.sparkdsg",
     "rerun": "export {run} --out {folder}/run.rrd",
     "foxglove": "export {run} --out {folder}/run.mcap",
     "benchmark": "benchmark --out {folder}/bench",
@@ -196,7 +194,7 @@ def test_a_missing_extra_is_named(tmp_path, scene_file, views, extra):
     if extra == "ros":
         write_bag(tmp_path / "pour.bag", views)
     run = tmp_path / "run"
-    if extra in ("view", "usd", "dsg", "rerun", "foxglove"):
+    if extra in ("view", "usd", "rerun", "foxglove"):
         words = ["--views", 1, "--out", run, *SMALL, "--quiet", "--no-report"]
         assert run_command("explore", scene_file, *words) == 0
     before = sorted(tmp_path.rglob("*"))

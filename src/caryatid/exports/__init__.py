@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from caryatid.config import ExportConfig, ExportFormat
 from caryatid.errors import InputError
-from caryatid.exports.graphs import to_dot, to_dsg, to_graphml
+from caryatid.exports.graphs import to_dot, to_graphml
 from caryatid.exports.models import to_gltf, to_mjcf, to_urdf, to_usd
 from caryatid.exports.motion import planning_scene
 from caryatid.graph import SupportGraph
@@ -35,7 +35,6 @@ FORMATS: Final[dict[ExportFormat, Format]] = {
     ),
     "moveit": Format((".json",), lambda graph, config, _: json_text(planning_scene(graph, config.frame))),
     "graphml": Format((".graphml",), lambda graph, config, _: to_graphml(graph)),
-    "dsg": Format((".sparkdsg",), lambda graph, config, _: to_dsg(graph)),
     "dot": Format((".dot", ".gv"), lambda graph, config, _: to_dot(graph)),
 }
 """The formats by name."""

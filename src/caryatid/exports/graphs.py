@@ -1,18 +1,13 @@
-"""The support graph for other programs: GraphML, DOT and spark_dsg."""
+"""The support graph for other programs: GraphML and DOT."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
-
-from caryatid.errors import InputError, needs_extra
 from caryatid.geometry.solids import Solid
 from caryatid.graph import SupportGraph
-from caryatid.viz.colours import ink_on, object_colour, rgb
+from caryatid.viz.colours import ink_on, object_colour
 
 
 def to_graphml(graph: SupportGraph) -> str:
@@ -60,38 +55,6 @@ def to_dot(graph: SupportGraph) -> str:
         ends = " -> ".join(_quoted(name) for name in support.pair)
         lines.append(f"  {ends} [{_listed(attributes)}];")
     return "\n".join([*lines, "}"]) + "\n"
-
-
-def to_dsg(graph: SupportGraph) -> bytes:
-    """A scene graph of spark_dsg: a node `O3` with a box for `o3`, an edge from supporter to supported.
-
-    It has one edge for two objects: of those that hold each other, the one from below.
-
-    Raises:
-        InputError: spark-dsg (extra `dsg`) is not installed, or two objects have the same label.
-    """
-    with needs_extra("dsg", "the format dsg"):
-        import spark_dsg as dsg
-
-    made, nodes = dsg.DynamicSceneGraph(), {o.id: dsg.NodeSymbol("O", o.label) for o in graph.objects}
-    for item in graph.objects:
-        known, T, shape = dsg.ObjectNodeAttributes(), item.shape.T_world_object, item.shape
-        known.name, known.position = item.title, T[:3, 3]
-        known.bounding_box = dsg.BoundingBox(dsg.BoundingBoxType.RAABB, shape.extents, T[:3, 3], T[:3, :3])
-        known.color = np.array(rgb(object_colour(item.label)), dtype=np.uint8)
-        known.metadata.set({"id": item.id, "role": item.role, "shape": shape.kind})
-        if not made.add_node(dsg.DsgLayers.OBJECTS, nodes[item.id], known):
-            reason = f"two objects have the label {item.label}"
-            raise InputError("the scene model", reason, "give each object its own in graph.json")
-    for s in sorted(graph.supports, key=lambda s: s.kind == "top-down"):
-        edge = dsg.EdgeAttributes()
-        edge.weighted, edge.weight = True, s.belief
-        edge.metadata.set({"kind": s.kind})
-        made.insert_edge(nodes[s.supporter], nodes[s.supported], edge)
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "graph.sparkdsg"
-        made.save(path)
-        return path.read_bytes()
 
 
 def _listed(attributes: Mapping[str, str]) -> str:
