@@ -26,7 +26,7 @@ import numpy as np
 HERE = Path(__file__).parent
 SHARED = HERE.parents[1] / "shared"
 GOLDEN = HERE / "golden" / "runs.json"
-EXPORTS = ("xml", "urdf", "glb", "graphml", "dot")
+EXPORTS = ("xml", "urdf", "glb", "dot")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import shutil
 from dataclasses import replace
 
 import mujoco
-import networkx as nx
 import numpy as np
 import pydot
 import pytest
@@ -106,7 +105,7 @@ def test_a_model_is_a_scene_and_stays_where_it_is_in_mujoco(tmp_path, kept_run):
     assert np.degrees(turns.magnitude()).max() < 3.0
 
 
-@pytest.mark.parametrize("name", ["scene.xml", "scene.urdf", "scene.gltf", "scene.graphml", "scene.dot"])
+@pytest.mark.parametrize("name", ["scene.xml", "scene.urdf", "scene.gltf", "scene.dot"])
 def test_every_support_surface_is_exported(tmp_path, name):
     export_graph(shelf_graph(), tmp_path / name)
     text = (tmp_path / name).read_text()
@@ -346,20 +345,6 @@ def test_gltf_has_a_coloured_node_for_each_object(tmp_path, graph, name):
 # Graphs
 
 
-def test_graphml_is_the_graph(tmp_path, graph):
-    export_graph(graph, tmp_path / "graph.graphml")
-    read = nx.read_graphml(tmp_path / "graph.graphml")
-    assert read.is_directed()
-    assert set(read.nodes) == {o.id for o in graph.objects}
-    assert set(read.edges) == {s.pair for s in graph.supports}
-    for item in graph.objects:
-        node = read.nodes[item.id]
-        assert (node["role"], node["shape"], node["label"]) == (item.role, item.shape.kind, item.label)
-        assert np.allclose([node["x"], node["y"], node["z"]], item.centre_world)
-    assert read.nodes["o2"]["size"] == "0.04 0.12"
-    assert read.edges["o1", "o2"] == {"kind": "lean", "certain": False, "occurrences": 1, "opportunities": 3}
-
-
 def test_dot_is_the_graph(tmp_path, graph):
     export_graph(graph, tmp_path / "graph.dot")
     (read,) = pydot.graph_from_dot_file(str(tmp_path / "graph.dot"))
@@ -375,13 +360,12 @@ def test_dot_is_the_graph(tmp_path, graph):
 @pytest.mark.parametrize("name", ['say "hi" -> b; c', "back\\slash", "<b>&amp;</b>", "two\nlines Öl"])
 def test_any_name_of_an_object_stays_one_name(tmp_path, graph, name):
     objects = tuple(replace(o, id=name) if o.id == "o15" else o for o in graph.objects)
-    files = {ending: tmp_path / f"scene.{ending}" for ending in ("dot", "graphml", "urdf", "glb", "xml")}
+    files = {ending: tmp_path / f"scene.{ending}" for ending in ("dot", "urdf", "glb", "xml")}
     for path in files.values():
         export_graph(replace(graph, objects=objects), path)
     (read,) = pydot.graph_from_dot_file(str(files["dot"]))
     assert len([n for n in read.get_nodes() if n.get_name() != "node"]) == 5
     assert len(read.get_edges()) == 3
-    assert name in nx.read_graphml(files["graphml"]).nodes
     assert len(yourdfpy.URDF.load(str(files["urdf"])).link_map) == 6
     assert len(trimesh.load(files["glb"]).geometry) == 5
     model = mujoco.MjModel.from_xml_path(str(files["xml"]))
@@ -398,7 +382,6 @@ def test_any_name_of_an_object_stays_one_name(tmp_path, graph, name):
         "s.urdf",
         "s.glb",
         "s.gltf",
-        "s.graphml",
         "s.gv",
         "s.usda",
         "s.json",

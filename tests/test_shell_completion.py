@@ -49,7 +49,7 @@ def test_commands_options_values_and_files_are_completed(offered):
     assert offered("explore", "tower", "--fusion", "") == {"pc", "sg", "pc+sg"}
     assert offered("explore", "tower", "--planner", "") >= {*BUILT_IN, "oracle"}
     assert offered("benchmark", "--suite", "") >= {"smoke", "fig5", "planners", "full"}
-    formats = {"mjcf", "urdf", "usd", "gltf", "moveit", "graphml", "dot"}
+    formats = {"mjcf", "urdf", "usd", "gltf", "moveit", "dot"}
     assert offered("export", "run", "--format", "") == formats
     assert "table.pcd" in offered("explore", "x", "--out", "ta")
     assert offered("extract", "tab") == {"table.pcd"}

@@ -52,7 +52,7 @@ def main() -> None:
     lap("extract")
     order = json.loads(caryatid("order", "run", "--set", "rehearsal.draws=2", "--risk", "0.2", "--json"))
     check(len(order["steps"]) > 0, "no removal order was found")
-    for ending in ("xml", "urdf", "glb", "json", "graphml", "dot"):
+    for ending in ("xml", "urdf", "glb", "json", "dot"):
         file = f"scene.{ending}"
         caryatid("export", "run", "--out", file)
         check(Path(file).stat().st_size > 100, f"{file} is empty")

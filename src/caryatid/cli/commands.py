@@ -317,7 +317,7 @@ class Export(options.Command, work="results:export_model"):
     """File to write, with the suffix of its format; replaces an existing file."""
     format: Annotated[ExportFormat | None, options.shown(default="by the suffix of FILE")] = None
     """mjcf (.xml), usd: free bodies on a table; urdf: links fixed to the world; gltf (.glb): meshes;
-    moveit (.json): planning scene; graphml, dot: the graph."""
+    moveit (.json): planning scene; dot: the graph."""
 
 
 class Benchmark(options.Command, work="results:compare_methods"):

@@ -25,6 +25,6 @@ GripperKind = Literal["none", "parallel", "suction"]
 GripperName = Literal["none", "parallel", "suction", "franka", "robotiq-85", "robotiq-140", "so-101"]
 """Kinds of grippers, and those whose dimensions are known (`GRIPPERS`)."""
 ExportFormat = Literal[
-    "mjcf", "urdf", "usd", "gltf", "moveit", "graphml", "dot",
+    "mjcf", "urdf", "usd", "gltf", "moveit", "dot",
 ]  # fmt: skip
 """Export formats of a scene model."""

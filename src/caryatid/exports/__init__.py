@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from caryatid.config import ExportConfig, ExportFormat
 from caryatid.errors import InputError
-from caryatid.exports.graphs import to_dot, to_graphml
+from caryatid.exports.graphs import to_dot
 from caryatid.exports.models import to_gltf, to_mjcf, to_urdf, to_usd
 from caryatid.exports.motion import planning_scene
 from caryatid.graph import SupportGraph
@@ -34,7 +34,6 @@ FORMATS: Final[dict[ExportFormat, Format]] = {
         (".glb", ".gltf"), lambda graph, config, end: to_gltf(graph, config, binary=end == ".glb")
     ),
     "moveit": Format((".json",), lambda graph, config, _: json_text(planning_scene(graph, config.frame))),
-    "graphml": Format((".graphml",), lambda graph, config, _: to_graphml(graph)),
     "dot": Format((".dot", ".gv"), lambda graph, config, _: to_dot(graph)),
 }
 """The formats by name."""

@@ -1,35 +1,12 @@
-"""The support graph for other programs: GraphML and DOT."""
+"""The support graph for Graphviz."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from caryatid.geometry.solids import Solid
 from caryatid.graph import SupportGraph
 from caryatid.viz.colours import ink_on, object_colour
-
-
-def to_graphml(graph: SupportGraph) -> str:
-    """Edges run from supporter to supported; sizes and centres x, y, z of vertices are in metres."""
-    import networkx as nx
-
-    plain = nx.DiGraph()
-    for item in graph.objects:
-        x, y, z = item.centre_world.tolist()
-        size = list(item.shape.extents) if isinstance(item.shape, Solid) else item.shape.size
-        lengths = size.values() if isinstance(size, Mapping) else size
-        attributes: dict[str, Any] = {"role": item.role, "label": item.label, "shape": item.shape.kind}
-        attributes |= {"size": " ".join(f"{length:.6g}" for length in lengths), "x": x, "y": y, "z": z}
-        attributes["colour"] = object_colour(item.label)
-        attributes |= {} if item.name is None else {"name": item.name}
-        attributes |= {"occurrences": item.occurrences, "opportunities": item.opportunities}
-        plain.add_node(item.id, **attributes)
-    for support in graph.supports:
-        names = ("kind", "certain", "occurrences", "opportunities")
-        known = {} if support.probability is None else {"probability": support.probability}
-        plain.add_edge(*support.pair, **known, **{name: getattr(support, name) for name in names})
-    return "\n".join(nx.generate_graphml(plain)) + "\n"
 
 
 def to_dot(graph: SupportGraph) -> str:
