@@ -43,7 +43,7 @@ PAGES = [
 ]
 LANGUAGES = {"python", "sh", "console", "bash", "text", "json", "toml", "xml", ""}
 FENCE = re.compile(r"^(`{3,})([^\n`]*)\n(.*?)^\1$", re.M | re.S)
-COMMAND = re.compile(r"^(?:\$ )?(?:caryatid|pip|make|python|dask|docker|git|import|from) ", re.M)
+COMMAND = re.compile(r"^(?:\$ )?(?:caryatid|pip|make|python|docker|git|import|from) ", re.M)
 STAYS = {"serve", "view"}
 """Commands that go on until they are stopped."""
 SHORT = {
@@ -121,7 +121,6 @@ def workplace(prepared, tmp_path, monkeypatch):
     place = shutil.copytree(prepared, tmp_path / "here")
     monkeypatch.chdir(place)
     monkeypatch.setattr("caryatid.cli.results.run_locally", lambda *arguments: (row for row in ()))
-    monkeypatch.setattr("caryatid.cli.results.run_on_cluster", lambda *arguments: (row for row in ()))
     return place
 
 

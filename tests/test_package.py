@@ -134,7 +134,6 @@ MODULES = {
     "foxglove": ["foxglove"],
     "learn": ["gymnasium"],
     "benchmark": ["pandas", "pyarrow"],
-    "cluster": ["distributed", "dask"],
 }
 
 BLOCKED = """
@@ -183,7 +182,6 @@ WORDS = {
     "rerun": "export {run} --out {folder}/run.rrd",
     "foxglove": "export {run} --out {folder}/run.mcap",
     "benchmark": "benchmark --out {folder}/bench",
-    "cluster": "benchmark --suite smoke --scheduler tcp://127.0.0.1:1 --out {folder}/bench",
 }
 
 

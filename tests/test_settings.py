@@ -98,10 +98,6 @@ def test_a_value_of_the_wrong_type_or_range_says_what_is_wanted(flag, wanted):
     [
         ("extract recording --masks . --segmentation auto", "--segmentation auto, which uses no masks"),
         ("extract table.pcd --masks .", "masks need images, and a cloud has none"),
-        (
-            "benchmark --suite smoke --scheduler tcp://127.0.0.1:1 --jobs 2",
-            "cannot be combined with --scheduler",
-        ),
     ],
 )
 def test_options_that_exclude_each_other_are_refused(words, said, tmp_path, capsys):

@@ -48,7 +48,7 @@ def test_commands_options_values_and_files_are_completed(offered):
     assert offered("explore", "tower", "--no") == {"--noise", "--no-early-stop", "--no-report"}
     assert offered("explore", "tower", "--fusion", "") == {"pc", "sg", "pc+sg"}
     assert offered("explore", "tower", "--planner", "") >= {*BUILT_IN, "oracle"}
-    assert offered("benchmark", "--suite", "") >= {"smoke", "fig5", "planners", "full"}
+    assert offered("benchmark", "--suite", "") >= {"smoke", "fig5", "planners"}
     formats = {"mjcf", "urdf", "usd", "gltf", "moveit", "dot"}
     assert offered("export", "run", "--format", "") == formats
     assert "table.pcd" in offered("explore", "x", "--out", "ta")

@@ -1,40 +1,21 @@
-"""Running episodes: in processes of this machine, or on the workers of a dask.distributed scheduler."""
+"""Running episodes in processes of this machine."""
 
 from __future__ import annotations
 
-import asyncio
-import logging
 import os
 import signal
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import (
-    BrokenExecutor,
-    CancelledError,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    as_completed,
-)
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import replace
 from multiprocessing import active_children, get_context, parent_process
-from threading import Lock, Thread, current_thread, main_thread
-from typing import TYPE_CHECKING
+from threading import Thread, current_thread, main_thread
 
-from caryatid.benchmark.episodes import Episode, Outcome, plugin_of, run_episode
-from caryatid.errors import CaryatidError, InputError
-from caryatid.runtime import fingerprint
+from caryatid.benchmark.episodes import Episode, Outcome, run_episode
+from caryatid.errors import CaryatidError
 from caryatid.runtime.parallel import one_blas_thread
 
-if TYPE_CHECKING:
-    from distributed import Client
 
-Outcomes = Generator[tuple[Episode, Outcome]]
-
-_one_at_a_time = Lock()
-
-
-def run_locally(episodes: Sequence[Episode], jobs: int) -> Outcomes:
+def run_locally(episodes: Sequence[Episode], jobs: int) -> Generator[tuple[Episode, Outcome]]:
     """Run episodes in this many processes; yield each with its outcome as soon as it is done.
 
     Raises:
@@ -44,7 +25,7 @@ def run_locally(episodes: Sequence[Episode], jobs: int) -> Outcomes:
     pool = ProcessPoolExecutor(min(jobs, len(episodes)), get_context("spawn"), initializer=_end_with_parent)
     try:
         with _interrupts_ignored():
-            futures = {pool.submit(run_on_worker, episode, fingerprint()): episode for episode in episodes}
+            futures = {pool.submit(_run_alone, episode): episode for episode in episodes}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()
     except BrokenExecutor:
@@ -58,100 +39,12 @@ def run_locally(episodes: Sequence[Episode], jobs: int) -> Outcomes:
         pool.shutdown(cancel_futures=True)
 
 
-def run_on_cluster(
-    episodes: Sequence[Episode],
-    address: str,
-    tell: Callable[[str], None] = lambda text: None,
-    patience: float = 10.0,
-) -> Outcomes:
-    """Run episodes on the workers of a scheduler, which must answer within `patience` [s].
-
-    Yields each with its outcome as soon as it is done; calls `tell` if there are no workers.
-
-    Raises:
-        InputError: No scheduler answers.
-        CaryatidError: The scheduler has gone, or a worker has other code.
-    """
-    code = fingerprint()
-    with connect(address, patience) as client:
-        pool = client.get_executor(pure=False)
-        futures = {}
-        for episode in episodes:  # workers have other working directories
-            placed = replace(episode, scene=os.path.abspath(episode.scene)) if episode.content else episode
-            futures[pool.submit(run_on_worker, placed, code)] = episode
-        if not client.nthreads():
-            tell(f"no workers; start some: dask worker {address} --nthreads 1 --nworkers N")
-        for future in as_completed(futures):
-            yield futures.pop(future), _cluster_outcome(future, address)
-
-
-def connect(address: str, patience: float = 10.0) -> Client:
-    """Connect to a scheduler of dask.distributed, which must answer within `patience` [s].
-
-    Raises:
-        InputError: No scheduler answers.
-    """
-    from distributed import Client, Security
-    from distributed.comm import connect as open_connection
-
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors are reported here
-
-    async def greet() -> None:
-        """Fail at once, where a client would keep trying."""
-        secrets = Security().get_connection_args("client")
-        connection = open_connection(address, patience, **secrets)
-        await (await asyncio.wait_for(connection, patience)).close()
-
-    try:
-        if not address:
-            raise ValueError("the address is empty")
-        with ThreadPoolExecutor(1) as thread:
-            thread.submit(asyncio.run, greet()).result()
-        return Client(address, timeout=patience, set_as_default=False)
-    except (OSError, ImportError, ValueError, TypeError, RuntimeError, MemoryError) as error:
-        reason = f"no scheduler answers ({' '.join(str(error).split()) or 'it is silent'})"
-        remedy = "start one with `dask scheduler` and give its address, such as tcp://10.0.0.5:8786"
-        raise InputError(f"--scheduler {address}", reason, remedy) from None
-
-
-def run_on_worker(episode: Episode, code: str) -> Outcome:
-    """Run an episode in a process of a pool or cluster, one at a time and on one thread.
-
-    Raises:
-        CaryatidError: The fingerprint of the worker's code is another, or the package of the planner is.
-    """
+def _run_alone(episode: Episode) -> Outcome:
+    """Run an episode on one thread, because each core has a process."""
     from numba import set_num_threads
 
-    if fingerprint() != code:
-        raise _other_code(fingerprint())
-    if plugin_of(episode.planner) != episode.plugin:
-        reason = f"a worker lacks the package of planner {episode.planner}, or has another version of it"
-        raise CaryatidError(f"{reason}; install it there and start the worker again")
-    with _one_at_a_time:
-        set_num_threads(1)
-        return one_blas_thread(run_episode)(episode)
-
-
-def _cluster_outcome(future: Future[Outcome], address: str) -> Outcome:
-    from distributed import KilledWorker
-
-    try:
-        return future.result()
-    except KilledWorker as error:
-        died = error.allowed_failures + 1
-        return Outcome((), f"{died} workers died running it, perhaps for lack of memory")
-    except CaryatidError:
-        raise
-    except (CancelledError, OSError):
-        reason = f"the scheduler at {address} has gone; finished episodes are kept"
-        raise CaryatidError(f"{reason}: start again") from None
-    except Exception as error:
-        raise _other_code(f"{type(error).__name__}: {error}") from None
-
-
-def _other_code(found: str) -> CaryatidError:
-    reason = f"a worker runs other code ({found}) than this process ({fingerprint()})"
-    return CaryatidError(f"{reason}; install the same caryatid and libraries there and start it again")
+    set_num_threads(1)
+    return one_blas_thread(run_episode)(episode)
 
 
 def _end_with_parent() -> None:

@@ -282,14 +282,5 @@ SUITES: Mapping[str, Suite] = {
         {order: {"order": order} for order in ORDERS}, (*DESIGNED, *HEAPED), seeds=1, views=10,
         reference="highest first",
     ),
-    "full": Suite(
-        "Every planner with every fusion under every condition; for a cluster.",
-        {
-            f"{planner} {label}": {"planner": planner, **own}
-            for planner, (label, own) in product(_PLANNERS, _FUSED.items())
-        },
-        (*DESIGNED, *PILES, *DENSE), {"labels, no noise": {"noise": "none"}, LABELS: {}, **_NOISE, **_AUTO},
-        views=10,
-    ),
 }  # fmt: skip
 """All suites by name."""

@@ -23,7 +23,7 @@ from caryatid.config import ExportFormat, FusionMethod, NoiseModel, Preset, Segm
 
 SuiteName = Literal[
     "smoke", "fig5", "fig5-paper", "presets", "planners", "path", "ablation", "ablation-attention", "poses",
-    "noise", "house", "easy", "heaps", "dismantle", "full",
+    "noise", "house", "easy", "heaps", "dismantle",
 ]  # fmt: skip
 """Names of the suites; the benchmark is imported later."""
 VIEWER_PORT = 8770
@@ -357,8 +357,6 @@ class Benchmark(options.Command, work="results:compare_methods"):
     """Number of views of every episode, including the first."""
     jobs: Annotated[options.Count | None, options.shown(default="all cores")] = None
     """Number of processes."""
-    scheduler: Annotated[str | None, options.shown("ADDRESS")] = None
-    """Run on the workers of this dask.distributed scheduler, such as tcp://10.0.0.5:8786."""
     retry: options.Flag = False
     """Run failed episodes again."""
     reference: Annotated[str | None, options.shown("METHOD")] = None

@@ -17,7 +17,7 @@ from caryatid import __version__
 from caryatid.benchmark.episodes import Episode, short_name
 from caryatid.benchmark.report import check_reference
 from caryatid.benchmark.report import write_report as write_benchmark
-from caryatid.benchmark.running import run_locally, run_on_cluster
+from caryatid.benchmark.running import run_locally
 from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES, change_suite
 from caryatid.cli import NOT_SAFE
@@ -36,7 +36,7 @@ from caryatid.cli.commands import (
 from caryatid.cli.options import LiftingCommand, Settings
 from caryatid.cli.output import kept, table
 from caryatid.config import Config
-from caryatid.errors import InputError, needs_extra
+from caryatid.errors import InputError
 from caryatid.evaluation.truths import evaluate_run
 from caryatid.exports import export_graph, format_of
 from caryatid.exports.streams import STREAMS, Stream
@@ -283,12 +283,6 @@ def _plan_order(run: Run, config: Config, asked: LiftingCommand | None) -> order
 
 def compare_methods(command: Benchmark) -> None:
     import_pandas()
-    if command.scheduler is not None:
-        with needs_extra("cluster", "--scheduler"):  # before anything is written
-            import distributed  # noqa: F401
-        if command.jobs is not None:
-            reason = "cannot be combined with --scheduler, which has its own workers"
-            raise InputError("--jobs", reason, "omit one of the two options")
     suite = None
     if command.suite is not None:
         suite = change_suite(
@@ -317,10 +311,7 @@ def compare_methods(command: Benchmark) -> None:
 def _run_episodes(command: Benchmark, suite: str, missing: list[Episode], store: ResultStore) -> None:
     """Run the missing episodes with a progress bar; without a terminal, print a line every minute."""
     output = command.output
-    if command.scheduler is not None:
-        episodes = run_on_cluster(missing, command.scheduler, output.say)
-    else:
-        episodes = run_locally(missing, command.jobs or os.cpu_count() or 1)
+    episodes = run_locally(missing, command.jobs or os.cpu_count() or 1)
     total = len({member.episode for member in store.suites[suite]})
     console = output.progress
     hidden = console.quiet or not console.is_interactive
