@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import run_command
 from raycast import TABLE, from_the_side, table_scene
+from scipy.spatial.transform import Rotation
 
 import caryatid as ct
 from caryatid.config.settings import read_settings
@@ -53,14 +54,6 @@ FAULTS = {
         lambda T: transforms.rigid(T[:3, :3].T, T[:3, 3])
     ),
     "all views have the same pose": posed(lambda T: from_the_side()),
-    r"tilted by 3\.8°, always the same way .*\(hand-eye calibration\)$": posed(
-        lambda T: (
-            T
-            @ transforms.rigid(
-                transforms.rotation_from_vector(np.array([0.0, 0.0, np.deg2rad(5.0)])), np.zeros(3)
-            )
-        )
-    ),
     r"multiply the focal lengths by 0\.8": lambda v: replace(
         v, K=v.K * [[1.25, 1, 1], [1, 1.25, 1], [1, 1, 1]]
     ),
@@ -92,7 +85,7 @@ def test_focal_lengths_are_right_once_multiplied(sound, factor):
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 def test_turned_images_are_right_once_their_poses_are_turned(sound, quarters):
-    def turned(view):
+    def quarter_turned(view):
         (height, width), (cx, cy), K = view.depth.shape, view.K[:2, 2], view.K.copy()
         K[:2, 2] = ((cy, width - 1 - cx), (width - 1 - cx, height - 1 - cy), (height - 1 - cy, cx))[
             quarters - 1
@@ -100,10 +93,64 @@ def test_turned_images_are_right_once_their_poses_are_turned(sound, quarters):
         K[[0, 1], [0, 1]] = K[[0, 1], [0, 1]] if quarters % 2 == 0 else K[[1, 0], [1, 0]]
         return replace(view, depth=np.rot90(view.depth, quarters).copy(), rgb=None, labels=None, K=K)
 
-    spoilt = [turned(view) for view in sound]
+    spoilt = [quarter_turned(view) for view in sound]
     (problem,) = diagnose(spoilt, Config()).problems
     R = eval(problem.partition("T_world_camera @ ")[2], {"np": np})
     assert diagnose([view.with_pose(view.pose @ R) for view in spoilt], Config()).problems == []
+
+
+def turned(*vector):
+    return transforms.rigid(Rotation.from_rotvec(vector, degrees=True).as_matrix(), np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def wrist():
+    """Views from several heights, with a rolled camera."""
+    boxes = [((x, y, TABLE + h / 2), (0.08, 0.1, h)) for x, y, h in [(0, 0, 0.2), (0.15, 0.2, 0.1)]]
+    turns = zip(
+        range(0, 360, 60), [42.0, 65.0, 50.0, 60.0, 45.0, 55.0], [-30, 20, 0, 30, -10, 40], strict=True
+    )
+    poses = [from_the_side(azimuth, elevation) @ turned(0, 0, roll) for azimuth, elevation, roll in turns]
+    return [replace(table_scene(T, boxes, sigma=0.002, half_table=(1.0, 1.0)), labels=None) for T in poses]
+
+
+@pytest.mark.parametrize("hand_eye", [(5, 0, 0), (0, -3, 4), (27, 4, 91), (-49, -7, -120)])
+def test_a_wrong_hand_eye_calibration_is_found_and_can_be_mended(wrist, hand_eye):
+    spoilt = [view.with_pose(view.pose @ turned(*hand_eye)) for view in wrist]
+    (problem,) = diagnose(spoilt, Config()).problems
+    assert f"the same turn of the camera, {np.linalg.norm(hand_eye):.1f}°" in problem
+    assert ("forgotten or inverted" in problem) == (np.linalg.norm(hand_eye) > 45.0)
+    assert "focal lengths" not in problem
+    X = turned(*map(float, re.search(r"from_rotvec\(\[(.*?)\]", problem)[1].split(",")))
+    mended = diagnose([view.with_pose(view.pose @ X) for view in spoilt], Config())
+    assert mended.problems == mended.doubts == []
+
+
+def test_views_alike_tell_only_a_part_of_a_turn(sound):
+    spoilt = [view.with_pose(view.pose @ turned(0.0, 0.0, 5.0)) for view in sound]
+    (problem,) = diagnose(spoilt, Config()).problems
+    assert "at least 3.9°" in problem
+    assert problem.endswith("calibrate again")
+
+
+def test_a_slight_tilt_is_a_doubt_about_what_is_turned(wrist):
+    found = diagnose([view.with_pose(turned(1.5, 1.5, 0.0) @ view.pose) for view in wrist], Config())
+    assert found.problems == []
+    assert any(re.search(r"world is tilted by 2\.1° .*--level", doubt) for doubt in found.doubts)
+    found = diagnose([view.with_pose(view.pose @ turned(1.5, 0.0, 0.0)) for view in wrist], Config())
+    assert found.problems == []
+    (doubt,) = found.doubts
+    assert "same turn of the camera, 1.5°" in doubt
+    assert "focal" not in doubt
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_poses_wrong_one_by_one_are_no_common_turn(wrist, seed):
+    rng = np.random.default_rng(seed)
+    spoilt = [view.with_pose(view.pose @ turned(*rng.normal(0.0, 0.5, 3))) for view in wrist]
+    found = diagnose(spoilt, Config())
+    assert found.problems == []
+    assert not any("tables" in doubt for doubt in found.doubts)
 
 
 def test_a_table_tilted_in_all_views_is_not_passed_over(sound):

@@ -50,6 +50,10 @@ STEEP = 45.0
 """Tilt of a plane beyond which it is a wall, and no table [deg]."""
 LEFT = 0.5
 """Maximum share of the planes' tilt that what explains it leaves [1]."""
+SURE = 16.3
+"""Sum of squares [σ²] that an explanation must save: its three numbers save it once in 1000 by chance."""
+STEPS = 20
+"""Number of steps in which a rotation of vectors is found [1]."""
 FOCAL_FACTORS = np.geomspace(0.5, 2.0, 57)
 """Factors of the focal lengths that are tried [1], 2.5 % apart: half and double mean another image size."""
 LEAST = 20
@@ -113,13 +117,12 @@ CAMERAS: Mapping[str, Callable[[Array], Array]] = {
     GL_AXES: lambda T: T @ GL,
     BODY_AXES: lambda T: T @ BODY,
     **{
-        f"the image is turned by {angle}° against its pose: give T_world_camera @ {matrix}": partial(
-            _turn_camera, angle=angle
-        )
-        for angle, matrix in (
-            (90, "[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
-            (180, "np.diag([-1, -1, 1, 1])"),
-            (-90, "[[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
+        f"the image is turned by {angle}° against its pose, as if the hand-eye calibration were {how}: give "
+        f"T_world_camera @ {matrix}": partial(_turn_camera, angle=angle)
+        for angle, how, matrix in (
+            (90, "forgotten", "[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
+            (180, "inverted", "np.diag([-1, -1, 1, 1])"),
+            (-90, "forgotten", "[[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
         )
     },
 }
@@ -547,9 +550,10 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
     if len(thin) > 1:
         shares = _overlaps(thin, max_tilt)
         best = _best_reading(shares)
-        mounting = _explain_tilts(thin)
-        if mounting and best in ("", EARLY, LATE) and usual.keys() <= {Z_UP}:
-            usual = {mounting: mounting}
+        cause, angle, of_world = _explain_tilts(thin, config.registration.rotation)
+        mounting = best in ("", EARLY, LATE) and usual.keys() <= {Z_UP} and not of_world
+        if mounting and angle >= MOUNTED:
+            usual = {cause: cause}
         elif best == OTHER_CAMERA:
             usual = {key: text for key, text in usual.items() if key not in conventions}
             usual["K"] = centre or OTHER_CAMERA
@@ -561,9 +565,11 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
             usual = {key: text for key, text in usual.items() if key not in conventions} | {best: best}
         elif _have_one_pose(thin):
             usual = {FIXED: FIXED}
-        elif not usual and shares[""] < LARGE:
+        elif shares[""] < LARGE:
             shared = f"{shares['']:.0%} of what they show above their largest planes"
             doubts.append(f"poses, because consecutive views share only {shared}")
+        # Registration can mend single poses, but not what all have in common.
+        doubts += [f"level tables: {cause}"] * (angle >= 2.0 * config.registration.rotation)
     # What is wrong may hide the rest.
     return Diagnosis(rows, list(usual.values()), [] if usual else doubts)
 
@@ -584,37 +590,65 @@ def _have_one_pose(views: Sequence[View]) -> bool:
     return bool(np.median(shares) > 0.5)
 
 
-def _explain_tilts(views: Sequence[View]) -> str:
-    """Say that cameras are turned against their poses, or K is wrong, if planes are tilted so; else "".
+def _explain_tilts(views: Sequence[View], sigma: float) -> tuple[str, float, bool]:
+    """Say what tilts the tables of views alike, or ""; how far [deg]; and whether it is the world alone.
 
-    Such a tilt goes with the camera, that of a world frame with the world.
+    A camera turned on its arm, or with other focal lengths, tilts them in its own frame.
+
+    Args:
+        views: Views with poses.
+        sigma: Standard deviation of the orientation of a pose [deg].
     """
-    planes = [(view.K, view.pose, find_image_plane(view)) for view in views]
-    tables = [(K, T, p) for K, T, p in planes if p.share >= LARGE and _tilt(T, p.normal_camera(K)) < STEEP]
-    if len(tables) < 2:
-        return ""
-    ups, normals = np.array([(T[2, :3], plane.normal_camera(K)) for K, T, plane in tables]).swapaxes(0, 1)
-    normals_world = np.array([transforms.rotate(T, plane.normal_camera(K)) for K, T, plane in tables])
-    spread = _median_angle(normals_world, np.median(normals_world, axis=0))
-    # A small turn q of the camera moves each normal n by the part of q across n.
-    # Tables seen alike do not tell the turn about their normal: the least of the turns that fit is taken.
-    across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
-    q = np.linalg.lstsq(across.reshape(-1, 3), np.cross(normals, ups).ravel(), rcond=0.1)[0]
-    turn = Rotation.from_rotvec(q)
-    if spread < MOUNTED or _median_angle(turn.apply(normals), ups) > LEFT * spread:
-        return ""
-    said = (
-        f"the largest planes are tilted by {_median_angle(normals, ups):.1f}°, always the same way for "
-        "the camera: check how it is mounted (hand-eye calibration)"
-    )
-    scaled = [
-        [plane.normal_camera(K * [[f, 1, 1], [1, f, 1], [1, 1, 1]]) for K, _, plane in tables]
-        for f in FOCAL_FACTORS
-    ]
-    tilts = [_median_angle(np.array(n), ups) for n in scaled]
-    if min(tilts) < LEFT * spread:
-        said += f", or multiply the focal lengths by {FOCAL_FACTORS[int(np.argmin(tilts))]:.2g}"
-    return said
+    planes = [(view, plane) for view in views if (plane := find_image_plane(view)).share >= LARGE]
+    if len(planes) < 3:  # The turn of a camera explains nearly all of two.
+        return "", 0.0, False
+    ups = np.array([view.pose[2, :3] for view, _ in planes])
+    scaled = np.array([
+        [plane.normal_camera(view.K * [[f, 1, 1], [1, f, 1], [1, 1, 1]]) for view, plane in planes]
+        for f in (1.0, *FOCAL_FACTORS)
+    ])  # fmt: skip
+    best = int(np.argmin(np.median(transforms.angle_between(scaled, ups), axis=1)))
+    normals, factor = scaled[0], (1.0, *FOCAL_FACTORS)[best]
+    turn, known = _find_turn(normals, ups, np.radians(sigma))
+    world = np.array([transforms.rotate(v.pose, n) for (v, _), n in zip(planes, normals, strict=True)])
+    mean = np.median(world, axis=0)
+    pairs = (normals, ups), (turn.apply(normals), ups), (scaled[best], ups), (world, mean)
+    left = np.degrees([transforms.angle_between(a, b) for a, b in pairs])
+    tables = left.min(axis=0) < STEEP
+    declared, *costs = ((left[:, tables] / sigma) ** 2).sum(axis=1)
+    if 2 * tables.sum() <= len(views) or declared - min(costs) < SURE or min(costs) > LEFT**2 * declared:
+        return "", 0.0, False
+    mount, focal, tilted = (bool(cost - min(costs) < SURE) for cost in costs)
+    by, tilt = np.degrees([turn.magnitude(), transforms.angle_between(mean, UP)]).tolist()
+    vector = ", ".join(f"{x:.1f}" for x in turn.as_rotvec(degrees=True))
+    causes = [
+        f"all poses are off by the same turn of the camera, {'' if known else 'at least '}{by:.1f}°: the "
+        f"hand-eye calibration is wrong{', perhaps forgotten or inverted' * (by > STEEP)}: calibrate again"
+        + f", or turn it on the right by Rotation.from_rotvec([{vector}], degrees=True)"
+        * known
+    ] * mount
+    # Calibration leaves small turns; wrong focal lengths are those of another image.
+    causes += [f"multiply the focal lengths by {factor:.2g}"] * (focal and (by >= MOUNTED or not mount))
+    causes += [f"the world is tilted by {tilt:.1f}° (is the robot's base level?): {Z_UP}"] * tilted
+    return ", or ".join(causes), by if mount or focal else tilt, not (mount or focal)
+
+
+def _find_turn(vectors: Array, others: Array, sigma: float) -> tuple[Rotation, bool]:
+    """Find the rotation of vectors (N, 3) onto others, noise [rad], that fits most; is all of it known?
+
+    Vectors that are alike do not tell the turn about them: the least turn that fits is taken.
+    """
+    turn, rank = Rotation.identity(), 0
+    # From the mean of all to the median, on which a few walls have no influence.
+    for tolerance in np.geomspace(np.pi, sigma, STEPS):
+        turned = turn.apply(vectors)
+        weights = 1.0 / np.maximum(transforms.angle_between(turned, others), tolerance)
+        # A small turn q moves each vector v by the part of q across v.
+        across = np.eye(3) - turned[:, :, None] * turned[:, None, :]
+        rows, values = weights[:, None, None] * across, weights[:, None] * np.cross(turned, others)
+        q, _, rank, _ = np.linalg.lstsq(rows.reshape(-1, 3), values.ravel(), rcond=0.1)
+        turn = Rotation.from_rotvec(q) * turn
+    return turn, bool(rank == 3)
 
 
 def _median_angle(a: Array, b: Array) -> float:
