@@ -74,10 +74,15 @@ def find_grasp(
     if isinstance(reachable, ReachabilityMap):
         reachable.check_use("reachable", "gripper", "world")
     jaw = gripper.kind == "parallel"
-    found = list(_antipodal(shape, gripper, friction) if jaw else _flat(shape, gripper))
+    sides = list(_antipodal(shape, gripper, friction) if jaw else _flat(shape, gripper))
+    found = [(T, width) for T, width in sides if width + 2.0 * gripper.clearance <= gripper.opening]
+    if not sides:
+        return Blocked((), "no two sides are opposite" if jaw else "no side is flat enough")
     if not found:
-        fits = f"no side fits between the fingers ({1e3 * gripper.opening:.0f} mm)"
-        return Blocked((), fits if jaw else "no side is flat enough")
+        lengths = min(width for _, width in sides), gripper.opening, gripper.clearance
+        side, opening, spare = (f"{1e3 * length:.0f} mm" for length in lengths)
+        fit = f"does not fit the gripper's {opening} less 2 × {spare}"
+        return Blocked((), f"its narrowest side, {side}, {fit}")
     poses, widths = np.array([T for T, _ in found]), np.array([width for _, width in found])
     turn = turn_of(gripper)
     if reachable is not None:
@@ -92,7 +97,7 @@ def find_grasp(
     arm = np.linalg.norm(poses[:, :3, 3] - shape.centre_of_mass, axis=1)
     lean = gripper.length * (1.0 + poses[:, 2, 2])  # how far the hand leans over, as a lever
     near = {i: o for i, o in others.items() if _near(o, shape, gripper)}
-    fewest, most = tuple[str, ...](), -1.0
+    fewest, most = dict[str, float](), -1.0
     for k in np.argsort(arm + lean, kind="stable").tolist():
         swept, risen = (
             transforms.transform(poses[k], _volume(gripper, widths[k], travel))
@@ -103,7 +108,8 @@ def find_grasp(
         path = np.concatenate([swept, *(risen + [0.0, 0.0, h] for h in np.arange(0.01, top, 0.01))])
         if (shape.signed_distance(swept) < 0.0).any():
             continue
-        by = tuple(i for i, o in near.items() if (o.signed_distance(path) < gripper.clearance).any())
+        missing = {i: gripper.clearance - float(o.signed_distance(path).min()) for i, o in near.items()}
+        by = {i: distance for i, distance in missing.items() if distance > 0.0}
         if by and fewest and len(by) >= len(fewest):
             continue
         free = None
@@ -120,7 +126,8 @@ def find_grasp(
             return Grasp(poses[k] @ turn, float(widths[k]), gripper.travel, free)
         fewest = by
     if fewest:
-        return Blocked(fewest, f"{', '.join(fewest)} in the way")
+        told = (f"{i} is in the way by at least {1e3 * distance:.0f} mm" for i, distance in fewest.items())
+        return Blocked(tuple(fewest), ", ".join(told))
     if most >= 0.0:
         seen = f"at most {100.0 * most // 1.0:.0f}% of the gripper's way was seen to be free"
         return Blocked((), f"{seen}, less than {gripper.seen:.0%}")
@@ -134,7 +141,7 @@ def turn_of(gripper: GripperConfig) -> Array:
 
 
 def _antipodal(shape: Shape, gripper: GripperConfig, friction: float) -> Iterator[tuple[Array, float]]:
-    """Poses (4, 4) of a parallel jaw, and the object's width [m] between its fingers."""
+    """Poses (4, 4) of a parallel jaw of any opening, and the object's width [m] between its fingers."""
     spacing = _spacing(shape)
     points, normals = shape.surface(spacing)
     cone = np.cos(np.arctan(friction))
@@ -144,8 +151,7 @@ def _antipodal(shape: Shape, gripper: GripperConfig, friction: float) -> Iterato
         beside = np.linalg.norm(way - along[:, None] * closing, axis=1)
         faces = (along > 1e-3) & (beside <= spacing) & (normals @ closing >= cone)
         # The nearest face ends the wall that the finger is at.
-        width = float(along[faces].min(initial=np.inf))
-        if width + 2.0 * gripper.clearance <= gripper.opening:
+        if np.isfinite(width := float(along[faces].min(initial=np.inf))):
             for approach in _approaches(closing, gripper):
                 R = np.column_stack([closing, np.cross(approach, closing), approach])
                 yield transforms.rigid(R, point + 0.5 * width * closing), width
