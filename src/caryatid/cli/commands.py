@@ -498,7 +498,7 @@ class Serve(SessionStep, work="sessions:serve_sessions"):
     token: Annotated[str | None, options.shown("TOKEN")] = None
     """Token that requests must send; prefer CARYATID_TOKEN, which process lists do not show."""
     open_sessions: options.Count = 4
-    """Number of sessions kept in memory; others are loaded on request in a tenth of a second."""
+    """Number of sessions kept in memory; others are computed again from their views on request."""
     waiting: options.Count = 16
     """Maximum number of requests that arrive or wait; further requests get status 503."""
     max_request: options.Count = 16

@@ -2,18 +2,14 @@
 
     DIR/session.jsonl          a log: the options, then a line per view, report of a change, and undo
     DIR/views/NNNNNN.npz       one view, decoded
-    DIR/state/….pickle         the scene after some of the lines; a cache, which may be deleted
 
 A view counts when its line is in the log, which is written after its file.
 """
 
 from __future__ import annotations
 
-import gzip
 import hashlib
-import io
 import logging
-import pickle
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
@@ -46,7 +42,6 @@ from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, Robot, Surroundings, find_robot, view_sphere_of
 from caryatid.robots.floor import STEP, FloorGrid
 from caryatid.robots.protocol import straight_lengths
-from caryatid.runtime import fingerprint
 from caryatid.runtime.parallel import check_budget, in_background
 from caryatid.scene import KEPT, Scene
 from caryatid.segmentation.diagnosis import describe_camera
@@ -66,18 +61,6 @@ ANOTHER_RELEASE: Final = "open it with that release, or add its views to a new s
 """Remedy for a session of another release."""
 REFUSED = "the robot cannot go there"
 """Reason to reject a view that a client refuses."""
-
-KNOWN: Final = {
-    ("builtins", "set"),
-    ("numpy", "dtype"),
-    ("numpy", "ndarray"),
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy._core.numeric", "_frombuffer"),
-}
-"""What a snapshot may contain of other packages."""
-ORIGINS: Final = {"config", "geometry", "graph", "objects", "paper", "scene", "segmentation", "sensing"}
-"""Parts of caryatid whose types it may contain. No other type is restored: a foreign session runs no code."""
 
 
 def is_session(folder: Path) -> bool:
@@ -403,7 +386,6 @@ class Session:
         self._log.append(asdict(event))
         self._events.append(event)
         self.scene = scene
-        self._write_snapshot(scene, self._events)
 
     def next(
         self,
@@ -538,38 +520,13 @@ class Session:
             scene.moved(event.name, event.T)
 
     def _after(self, events: Sequence[Event]) -> Scene:
-        """The scene after some events, from the newest usable snapshot and what came after it."""
-        b, done = self.beginning, 0
+        """The scene after some events, computed from their views."""
+        b = self.beginning
         scene = Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
-        for number in range(len(events), 0, -1):
-            # A damaged file may raise anything, and the events are still there.
-            with suppress(Exception):
-                content = gzip.decompress(self._snapshot(events[:number]).read_bytes())
-                found = _Unpickler(io.BytesIO(content)).load()
-                if isinstance(found, Scene):
-                    done, scene = number, found
-                    break
-        for number, event in enumerate(events[done:], start=done + 1):
-            self._apply(event, scene)
-            if self._log.writable:
-                self._write_snapshot(scene, events[:number])
+        with _muted():
+            for event in events:
+                self._apply(event, scene)
         return scene
-
-    def _write_snapshot(self, scene: Scene, events: Sequence[Event]) -> None:
-        """Keep the scene of all events, and of up to seven less, for undo; a failure costs only time."""
-        with suppress(Exception):
-            path = self._snapshot(events)
-            path.parent.mkdir(exist_ok=True)
-            # Not compressed; gzip has the checksum.
-            write_file(path, gzip.compress(pickle.dumps(scene, protocol=5), compresslevel=0))
-            kept = {self._snapshot(events[: len(events) - back]) for back in range(8)}
-            for older in set(path.parent.iterdir()) - kept:
-                older.unlink()
-
-    def _snapshot(self, events: Sequence[Event]) -> Path:
-        """File of the scene after these events, named by them and the code that made it."""
-        made_of = " ".join((fingerprint(), repr(self.beginning), *map(_told, events)))
-        return self.path / "state" / f"{hashlib.sha256(made_of.encode()).hexdigest()}.pickle"
 
 
 def table_floor(scene: Scene) -> FloorGrid:
@@ -609,16 +566,21 @@ def _told(event: Event) -> str:
     return event.digest or f"{event.name} {None if event.T is None else event.T.tolist()}"
 
 
-class _Unpickler(pickle.Unpickler):
-    """Restores only arrays and the parts of a scene."""
+@contextmanager
+def _muted() -> Iterator[None]:
+    """Keep what this thread logs from all handlers: it was logged when the views were added."""
+    handlers, muted = logging.getLogger("caryatid").handlers + logging.root.handlers, threading.get_ident()
 
-    def find_class(self, module: str, name: str) -> Any:
-        known, origin = (module, name) in KNOWN, module.split(".")[:2]
-        if known or (origin[0] == "caryatid" and origin[-1] in ORIGINS):
-            found = super().find_class(module, name)
-            if known or (isinstance(found, type) and found.__module__ == module):
-                return found
-        raise pickle.UnpicklingError(f"{module}.{name} is not part of a scene")
+    def is_other(record: logging.LogRecord) -> bool:
+        return record.thread != muted
+
+    for handler in handlers:
+        handler.addFilter(is_other)
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            handler.removeFilter(is_other)
 
 
 @contextmanager
