@@ -293,26 +293,6 @@ def test_the_same_seed_gives_the_same_graphs_byte_for_byte(tmp_path, scene_file)
 # What it says
 
 
-def test_a_profile_tells_the_time_of_each_stage_and_view(tmp_path, scene_file, capsys):
-    out = tmp_path / "run"
-    words = ["explore", scene_file, "--views", 2, *SMALL, "--out", out, "--profile", "--no-report"]
-    assert run_command(*words, "--quiet") == 0
-    table = {
-        line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines() if line.strip()
-    }
-    fit = [1000.0 * step["timings"]["fit"] for step in read_run(out).record["steps"]]
-    found = [table[name][table["view"].index("fit")] for name in ("1", "2", "median")]
-    assert found == [f"{time:.1f}" for time in (*fit, np.median(fit))]
-
-    assert run_command(*words, "--json") == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["graph"] == json.loads((out / "graph.json").read_text())
-    steps = read_run(out).record["steps"]
-    for number, (view, step) in enumerate(zip(document["profile"], steps, strict=True)):
-        thought = sum(seconds for stage, seconds in step["timings"].items() if stage != "capture")
-        assert view == {"view": number, "turn": pytest.approx(thought), **step["timings"]}
-
-
 def test_a_run_says_why_its_objects_are_what_they_are(kept_run, capsys):
     first, second = [o.id for o in read_run(kept_run).graph.objects if o.role == "object"][:2]
     assert run_command("why", kept_run, first, second, "--json") == 0

@@ -42,8 +42,6 @@ class RunCommand(options.ComputingCommand):
     """Run folder to write; replaces an existing run."""
     no_report: options.Flag = False
     """Do not write report.html."""
-    profile: options.Flag = False
-    """Print the time of each stage; with --json, add it to the document."""
 
 
 class Explore(RunCommand, options.ExploringCommand, work="run:explore_scene"):

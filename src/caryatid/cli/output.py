@@ -6,7 +6,6 @@ import logging
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from rich import box
@@ -119,19 +118,6 @@ def table(
     for row in rows:
         made.add_row(*map(Text, row))
     return made
-
-
-def profile(steps: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], Table]:
-    """Times of all stages of each view [s], from the steps in run.json, and the same as a table [ms]."""
-    stages = [*dict.fromkeys(stage for step in steps for stage in step["timings"]), "turn"]
-    views = [{"view": s["view"]} | s["timings"] | {"turn": turn(s["timings"])} for s in steps]
-    times = {f"{view['view'] + 1}": view for view in views}
-    times["median"] = {stage: median(view[stage] for view in views if stage in view) for stage in stages}
-    rows = [
-        [name, *(f"{1000.0 * view[stage]:.1f}" if stage in view else "" for stage in stages)]
-        for name, view in times.items()
-    ]
-    return views, table("time per view [ms]", ["view", *stages], rows, figures=True)
 
 
 def turn(timings: Mapping[str, float]) -> float:

@@ -19,7 +19,7 @@ import numpy as np
 
 from caryatid.cli import NOT_SAFE
 from caryatid.cli.commands import VIEWER_PORT, Clear, Demo, Explore, Extract, View
-from caryatid.cli.output import Output, kept, profile, table
+from caryatid.cli.output import Output, kept, table
 from caryatid.cli.results import write_report
 from caryatid.config import Config
 from caryatid.errors import GoalError, InputError
@@ -302,11 +302,7 @@ def _finish(
     if last.removal is not None:
         document["removal"] = last.removal.to_json()
     document |= {"graph": graph_to_json(last.graph), "warnings": output.warnings}
-    if command.profile:
-        document["profile"], shown = profile(writer.steps)
-        output.result(document, shown)
-    else:
-        output.result(document, "")
+    output.result(document, "")
 
 
 def _record(
