@@ -454,40 +454,6 @@ def test_view_says_in_one_line_what_it_cannot_show_or_where_it_cannot_listen(kep
     assert said in line
 
 
-@pytest.mark.slow
-def test_explore_shows_its_views_while_it_works(scene_file, tmp_path, monkeypatch, meanwhile, capsys):
-    pages = []
-    monkeypatch.setattr("webbrowser.open", pages.append)
-    meanwhile(lambda: pages.append(urllib.request.urlopen(pages[0]).status))
-    options = ("--out", tmp_path / "run", "--views", 2, "--view", "--no-report", *SMALL)
-    assert run_command("explore", scene_file, *options) == 0
-    assert pages[1] == 200
-    assert pages[0] in capsys.readouterr().err
-    with pytest.raises(OSError, match="refused"):
-        urllib.request.urlopen(pages[0])
-
-
-@pytest.mark.slow
-def test_an_interrupted_exploration_is_kept_and_its_page_closed(scene_file, tmp_path, monkeypatch, meanwhile):
-    shown, waited = [], []
-    monkeypatch.setattr("webbrowser.open", lambda url: None)
-    meanwhile(lambda: waited.append(True))
-    whole = Page.add
-
-    def interrupted(page, step, f1):
-        whole(page, step, f1)
-        shown.append(step.index)
-        if step.index == 1:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(Page, "add", interrupted)
-    options = ("--no-early-stop", "--view", "--no-report", "--quiet", *SMALL)
-    assert run_command("explore", scene_file, "--out", tmp_path / "run", *options) == 130
-    assert shown == [0, 1]
-    assert not waited
-    assert len(read_run(tmp_path / "run").views) == 2
-
-
 def test_a_scene_shows_itself_in_a_notebook_if_viser_is_there(views, monkeypatch):
     scene = Scene()
     shown = scene.show()

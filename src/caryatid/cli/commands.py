@@ -73,8 +73,6 @@ class Explore(RunCommand, options.ExploringCommand, work="run:explore_scene"):
     """Time for each view after the first; the robot then goes on while the view is being added."""
     stream: Annotated[str | None, options.shown("{FILE.rrd,FILE.mcap,rerun}")] = None
     """Also record each view for Rerun or Foxglove, or show it in Rerun's viewer."""
-    view: options.Flag = False
-    """Show the exploration in the browser; Ctrl-C closes the page."""
 
 
 class Demo(RunCommand, work="run:run_demo"):
@@ -82,15 +80,13 @@ class Demo(RunCommand, work="run:run_demo"):
 
     Usage examples:
       caryatid demo
-      caryatid demo --scene bridge --view
+      caryatid demo --scene bridge
     """
 
     source: Annotated[str, tyro.conf.arg(name="scene", metavar="NAME")] = "clutter"
     """Built-in scene, such as tower, bridge or dense-12-0."""
     views: Annotated[options.Count | None, options.default_of("active.max_views")] = None
     """Maximum number of views, including the first."""
-    view: options.Flag = False
-    """Show the exploration in the browser; Ctrl-C closes the page."""
 
 
 class View(options.ExploringCommand, work="run:show_run"):

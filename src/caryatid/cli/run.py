@@ -6,7 +6,7 @@ import os
 import sys
 import webbrowser
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, nullcontext, suppress
+from contextlib import closing, nullcontext, suppress
 from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from caryatid.cli import NOT_SAFE
-from caryatid.cli.commands import VIEWER_PORT, Clear, Demo, Explore, Extract, View
-from caryatid.cli.output import Output, kept, table
+from caryatid.cli.commands import Clear, Demo, Explore, Extract, View
+from caryatid.cli.output import kept, table
 from caryatid.cli.results import write_report
 from caryatid.config import Config
 from caryatid.errors import GoalError, InputError
@@ -50,19 +50,18 @@ def run_demo(command: Demo) -> None:
 
 def explore_scene(command: Explore) -> None:
     config, looking = command.config(), command.looking
-    with _watched(command.source, config, command.output) if command.view else nullcontext() as page:
-        with RunWriter(command.out, config, _about(command)) as writer:
-            source, masks = _open(command, config)
-            _check_goal(command, source, config)
-            name, truth = source.name, source.truth
-            planner, camera = planner_for(command.chosen_planner, source.camera, truth, config, **looking)
-            steps = explore(
-                camera, source.robot, planner=planner, config=config, masks=masks, goal=command.goal,
-                until=command.until, budget=command.budget, early_stop=not command.no_early_stop, **looking,
-            )  # fmt: skip
-            with Stream(command.stream) if command.stream else nullcontext() as stream:
-                last = _record(command, writer, name, steps, truth, page, stream)
-        _finish(command, writer, name, last, command.goal)
+    with RunWriter(command.out, config, _about(command)) as writer:
+        source, masks = _open(command, config)
+        _check_goal(command, source, config)
+        name, truth = source.name, source.truth
+        planner, camera = planner_for(command.chosen_planner, source.camera, truth, config, **looking)
+        steps = explore(
+            camera, source.robot, planner=planner, config=config, masks=masks, goal=command.goal,
+            until=command.until, budget=command.budget, early_stop=not command.no_early_stop, **looking,
+        )  # fmt: skip
+        with Stream(command.stream) if command.stream else nullcontext() as stream:
+            last = _record(command, writer, name, steps, truth, stream)
+    _finish(command, writer, name, last, command.goal)
 
 
 def extract_views(command: Extract) -> None:
@@ -238,23 +237,6 @@ def _check_found(goal: str | None, last: Step) -> None:
         raise GoalError(f"--goal {goal}", reason, f"objects found: {', '.join(found) or 'none'}")
 
 
-@contextmanager
-def _watched(name: str, config: Config, output: Output) -> Iterator[Page]:
-    """Open a page for an exploration; after its end, keep the page open until Ctrl-C."""
-    from caryatid.viewer.page import Page
-
-    sys.setswitchinterval(0.0005)  # As in `view`.
-    page = Page(f"caryatid: {name}", config, port=VIEWER_PORT)
-    output.say(f"{name} at {page.url}")
-    webbrowser.open(page.url)
-    try:
-        yield page
-        output.say("finished; the page stays open, press Ctrl-C to quit")
-        wait_for_interrupt()
-    finally:
-        page.close()
-
-
 def _conditions(command: Explore | Extract | Clear) -> str:
     """Source of the segments, and noise of a simulation."""
     simulated = kind_of(command.source) == "scene"
@@ -311,13 +293,12 @@ def _record(
     name: str,
     steps: Iterator[Step],
     truth: TrueScene | None = None,
-    page: Page | None = None,
     stream: Stream | None = None,
 ) -> Step:
     """Score, save, print and show every step; return the last."""
     output, last, conditions = command.output, None, _conditions(command)
     writer.more |= {"conditions": conditions, "warnings": output.warnings}
-    for step in steps if page is None else page.in_turn(steps):
+    for step in steps:
         scored = None if truth is None else score(step.graph, truth)
         writer.add(step, None if scored is None else asdict(scored))
         if last is None:
@@ -326,9 +307,8 @@ def _record(
             output.say(f"  done: {step.stop}")
         else:
             output.step(step, last, scored)
-        for shown in (page, stream):
-            if shown is not None:
-                shown.add(step, None if scored is None else scored.f1)
+        if stream is not None:
+            stream.add(step, None if scored is None else scored.f1)
         last = step
     assert last is not None, "the first view is always taken"
     return last

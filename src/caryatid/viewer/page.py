@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from html import escape
@@ -212,15 +212,6 @@ class Page:
         self._bar.visible = busy
         self.say(text)
         self.redraw()
-
-    def in_turn(self, steps: Iterator[Step]) -> Iterator[Step]:
-        """Compute steps one by one, each while this page computes nothing."""
-        while True:
-            with self.working:
-                step = next(steps, None)
-            if step is None:
-                return
-            yield step
 
     def redraw(self) -> None:
         """Schedule drawing, unless it is already scheduled."""
