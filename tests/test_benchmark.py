@@ -234,13 +234,9 @@ def figure(summary: pd.DataFrame, method: str, quantity: str, at: float = 0) -> 
         ("one", "paired scenes", 0, 2),
         ("one", "gap", 2, 0.5),
         ("one", "share", 0.9, 1.0),
-        ("one", "median views", 0.9, 2.5),
         ("one", "mean path", 0.9, 0.75),
         ("two", "share", 0.9, 1.0 / 3.0),
-        ("two", "median path", 0.9, np.inf),
         ("two", "mean path", 0.9, np.inf),
-        ("best", "area", 0, 0.75),
-        ("best", "budget", 0, 1.0),
     ],
 )
 def test_figures_by_hand(method, quantity, at, expected):

@@ -50,19 +50,12 @@ COUNTS = {("scenes", 0.0): "scenes", ("episodes", 0.0): "episodes", ("failed", 0
 PAIRED = {("paired scenes", 0.0): "scenes", ("paired episodes", 0.0): "episodes"}
 TO_THRESHOLD = {
     "share": "episodes that reach it",
-    "median views": "median views",
-    "median path": "median path [m]",
     "mean path": "path, mean curve [m]",
     "path ratio": "… relative to the reference",
 }
 """Quantities of a threshold of F1, and their headings."""
-TIMES = {
-    (kind, quantile): f"{kind}, {100.0 * quantile:g} %"
-    for kind in ("planning", "perception")
-    for quantile in (0.025, 0.5, 0.975)
-}
-DIGITS = dict.fromkeys(("path", "median path", "mean path", "path ratio", "gap"), 2)
-DIGITS |= dict.fromkeys(("median views", *(name for name, _ in (*COUNTS, *PAIRED))), 0)
+DIGITS = dict.fromkeys(("path", "mean path", "path ratio", "gap"), 2)
+DIGITS |= dict.fromkeys((name for name, _ in (*COUNTS, *PAIRED)), 0)
 """Decimals of quantities that do not have three."""
 NOTES = (
     "Means are over scenes; the seeds of a scene are averaged first. In brackets: the {confidence:g} % "
@@ -71,14 +64,9 @@ NOTES = (
     "its last scores.",
     "Differences are paired: a method minus the reference, over the scenes and seeds of both. Bold: the "
     "interval excludes 0.",
-    "Until F1 reaches a threshold: the share of episodes that reach it; the median over all episodes of the "
-    "first view that reaches it, and of the path up to there. An episode that never reaches it counts as "
-    "longer than any other, so the median is “not reached” if half of them never do. “Mean curve” is where "
-    "the curve of mean F1 over mean path first reaches it, with straight lines between views; an end of its "
-    "interval is “not reached” if that many resamples do not reach it.",
-    "F1 along the path: the area under F1 over path length, divided by the length. F1 holds until the next "
-    "view. The length is the median of the methods' mean path lengths; an episode that ends before keeps "
-    "its last F1.",
+    "Until F1 reaches a threshold: the share of episodes that reach it, and the path after which the curve "
+    "of mean F1 over mean path first does, with straight lines between views; an end of its interval is “not "
+    "reached” if that many resamples do not reach it.",
     "Probabilities are those of supports between true objects, in all scenes together. The Brier score is "
     "the mean of (p − true)²; 0 is perfect; a support that the graph lacks has p = 0. The expected "
     "calibration error is the mean difference between probability and share of true supports in {bins} "
@@ -353,9 +341,6 @@ def _tables(group: pd.DataFrame, measures: Mapping[str, str], reference: str) ->
     if main == "f1":
         for at in sorted(group["at"][group["quantity"] == "share"].unique(), reverse=True):
             tables[f"Until F1 reaches {at:.2f}"] = {(name, at): text for name, text in TO_THRESHOLD.items()}
-        budget = max(group["value"][group["quantity"] == "budget"], default=0.0)
-        title = f"F1 along the path, over {budget:.2f} m; quantiles of planning and perception times"
-        tables[title] = {("area", 0.0): "F1 along the path"} | TIMES
     for title, columns in tables.items():
         used = [column for column in columns if column in cells]
         if used and used[0] == next(iter(columns)):
@@ -371,8 +356,6 @@ def _table(title: str, head: Sequence[str], lines: Iterable[Sequence[str]]) -> s
 
 def _text(quantity: str, value: float, low: float, high: float) -> str:
     """A value with its interval, in the decimals of its quantity; bold if it is a difference other than 0."""
-    if quantity in ("planning", "perception"):
-        return f"{1e3 * value:.3g} ms" if value < 0.9995 else f"{value:.3g} s"
     if quantity == "share":
         return f"{100.0 * value:.0f} %"
     if quantity == "brier gain":

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from caryatid.benchmark.episodes import MEASURES, TIMES
+from caryatid.benchmark.episodes import MEASURES
 from caryatid.benchmark.store import import_pandas
 from caryatid.geometry.transforms import Array
 from caryatid.graph import DOUBTFUL
@@ -47,10 +47,9 @@ def summarise(table: pd.DataFrame, *, reference: str, gap: tuple[str, str] | Non
 
     Returns:
         One row per figure with the columns `COLUMNS`. Quantities: every measure (`at`: view), `MEASURE
-        difference` from the reference over the scenes and seeds both have, `gap`; `share`, `median views`,
-        `median path`, `mean path` and `path ratio` (`at`: threshold of F1); `area` under F1 over the path up
-        to `budget` [m]; `planning` and `perception` [s] (`at`: quantile); `scenes`, `episodes`, `failed`, and
-        `paired scenes`, `paired episodes`. Of the supports of all scenes together: `listed brier` of
+        difference` from the reference over the scenes and seeds both have, `gap`; `share`, `mean path` and
+        `path ratio` (`at`: threshold of F1); `scenes`, `episodes`, `failed`, and `paired scenes`, `paired
+        episodes`. Of the supports of all scenes together: `listed brier` of
         those in the graph, `brier gain` of these over doubtful = 0.5, others = 1, `calibration error`, and
         `pooled brier` with those that are missing (`at`: view); and of each bin at each VIEW `reliability
         VIEW`, the share that is true, and `supports VIEW`, how many (`at`: mean probability).
@@ -76,14 +75,12 @@ def _compare(
     done = group[group["error"].isna()]
     wide = done.pivot(index=["method", "scene", "seed"], columns="view", values=list(MEASURES)).astype(float)
     known = {str(method): own.droplevel("method") for method, own in wide.groupby("method")}
-    lengths = [float(own["path"].iloc[:, -1].groupby("scene").mean().mean()) for own in known.values()]
-    budget = float(np.median(lengths)) if lengths else 0.0
     for name, episodes in group.groupby("method", sort=False):
         method = str(name)
         own = known.get(method, wide.droplevel("method").iloc[:0])
         figures = [*_counts(own), _plain("failed", 0.0, episodes["error"].notna().sum())]
         if len(own):
-            figures += _alone(own, budget)
+            figures += _alone(own)
             figures += _calibration(episodes.dropna(subset="forecasts"))
             if method != reference and reference in known:
                 figures += _against(own, known[reference])
@@ -126,24 +123,19 @@ def bootstrap(frames: Sequence[pd.DataFrame], figures: Callable[..., Array]) -> 
     return np.stack([value, resampled[tail], resampled[-1 - tail]], axis=1)
 
 
-def _first_reach(f1: Array, path: Array, threshold: float) -> tuple[Array, Array]:
-    """First view (…), from 1, and path (…) [m] at which F1 (…, V) reaches a threshold; else infinite."""
-    reached = f1 >= threshold - 1e-9  # sums of equal figures differ by less
-    view = np.argmax(reached, axis=-1)
-    length = np.take_along_axis(path, view[..., None], -1)[..., 0]
-    missed = ~reached.any(axis=-1)
-    return np.where(missed, np.inf, view + 1.0), np.where(missed, np.inf, length)
-
-
 def _path_to(f1: Array, path: Array, threshold: float) -> Array:
-    """Path (…) [m] at which F1 (…, V), straight over the path between two views, reaches a threshold."""
-    view, end = _first_reach(f1, path, threshold)
-    index = np.where(np.isinf(view), 1.0, view).astype(int)[..., None] - 1
+    """Path (…) [m] at which F1 (…, V), straight over the path between two views, reaches a threshold.
+
+    It is infinite if none does.
+    """
+    reached = f1 >= threshold - 1e-9  # sums of equal figures differ by less
+    index = np.argmax(reached, axis=-1)[..., None]
     before = np.maximum(index - 1, 0)
-    start = np.take_along_axis(path, before, -1)[..., 0]
-    below, above = (np.take_along_axis(f1, at, -1)[..., 0] for at in (before, index))
+    (start, end), (below, above) = (
+        [np.take_along_axis(values, at, -1)[..., 0] for at in (before, index)] for values in (path, f1)
+    )
     share = np.divide(threshold - below, above - below, out=np.ones_like(end), where=above > below)
-    return np.where(np.isinf(end), np.inf, start + np.clip(share, 0.0, 1.0) * (end - start))
+    return np.where(reached.any(axis=-1), start + np.clip(share, 0.0, 1.0) * (end - start), np.inf)
 
 
 def _plain(quantity: str, at: float, value: float) -> Statistic:
@@ -159,28 +151,15 @@ def _counts(own: pd.DataFrame, prefix: str = "") -> Iterator[Statistic]:
     yield _plain(f"{prefix}episodes", 0.0, len(own))
 
 
-def _alone(own: pd.DataFrame, budget: float) -> Iterator[Statistic]:
-    """Curves of a method, its path to each threshold, the area under its F1, its times."""
-    f1, path = (own[name].to_numpy() for name in CURVE)
+def _alone(own: pd.DataFrame) -> Iterator[Statistic]:
+    """Curves of a method, how many episodes reach each threshold, and its path there."""
     means = own.copy()
+    f1, path = (own[name].to_numpy() for name in CURVE)
     for threshold in THRESHOLDS:
-        seen, length = _first_reach(f1, path, threshold)
-        means["share", threshold] = np.isfinite(seen).astype(float)
-        yield _plain("median views", threshold, np.median(seen))
-        yield _plain("median path", threshold, np.median(length))
-    if budget:
-        begins = np.minimum(path, budget)
-        begins[:, 0] = 0.0
-        # F1 holds from one view to the next.
-        means["area", 0.0] = np.sum(f1 * np.diff(begins, append=budget), axis=1) / budget
-    yield _plain("budget", 0.0, budget)
+        means["share", threshold] = np.isfinite(_path_to(f1, path, threshold)).astype(float)
     yield from _named(means.columns, bootstrap([means], lambda figures: figures))
     paths = bootstrap([own[name] for name in CURVE], _paths)
     yield from _named([("mean path", threshold) for threshold in THRESHOLDS], paths)
-    for name in TIMES:
-        seconds = own[name].iloc[:, int(name == "planning_seconds") :].to_numpy()
-        for quantile in (0.025, 0.5, 0.975) if seconds.size else ():
-            yield _plain(name.removesuffix("_seconds"), quantile, np.quantile(seconds, quantile))
 
 
 def _against(own: pd.DataFrame, other: pd.DataFrame) -> Iterator[Statistic]:
