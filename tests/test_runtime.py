@@ -7,10 +7,13 @@ import os
 import subprocess
 import sys
 
+import numba
+import numpy as np
 import pytest
 from conftest import SMALL
 
 from caryatid.runtime import parallel
+from caryatid.scene import Stopwatch
 
 # Sharing work out
 
@@ -127,6 +130,17 @@ def test_a_kernel_is_compiled_again_only_if_it_or_what_it_uses_has_changed(tmp_p
     for kept in (tmp_path / "cache").rglob("*.nb*"):
         kept.write_bytes(kept.read_bytes()[:-20])
     assert run_kernels(tmp_path, INNER.replace("STEP = 1", "STEP = 50"), "Renamed").stdout == "502 1\n"
+
+
+def test_compiling_a_kernel_is_not_counted_as_the_time_of_a_stage():
+    slow = numba.njit(lambda x: np.linalg.solve(x, x))
+    watch = Stopwatch()
+    slow(np.eye(3))
+    watch.lap("fit")
+    slow(np.eye(3))
+    watch.lap("plan")
+    assert watch.laps["compile"] > 10.0 * watch.laps["fit"] >= 0.0
+    assert [*watch.laps] == ["fit", "compile", "plan"]
 
 
 def test_without_a_folder_for_kernels_the_error_says_what_to_set(tmp_path):

@@ -54,7 +54,7 @@ def tower():
 def test_a_tower_is_known_after_a_walk_around_it(tower):
     assert edges(tower.graph) == {("o0", "o1"), ("o1", "o2"), ("o2", "o3"), ("o3", "o4"), ("o0", "o5")}
     assert [o.shape.kind for o in tower.graph.objects[1:]] == ["box", "cylinder", "box", "cylinder", "sphere"]
-    assert set(tower.timings) == {"segment", "register", "map", "fit", "infer", "fuse"}
+    assert set(tower.timings) - {"compile"} == {"segment", "register", "map", "fit", "infer", "fuse"}
     view, cloud = simulated_views("tower")[-1], tower.cloud
     on_objects = (tower.labels != 0) & (tower.labels != SUPPORT_LABEL)
     np.testing.assert_array_equal(tower.labels[on_objects], view.labels[on_objects])

@@ -81,7 +81,9 @@ class Output(logging.Handler):
         # The last graph is that after the lift.
         lifted = lift is not None and all(o.id != lift.object_id for o in step.graph.objects)
         when = ", after its lift" if lifted else ""
-        self.say(f"view {step.index + 1}{when}: {census(step.graph)}{f1} ({turn(step.timings):.1f} s)")
+        compiled = step.timings.get("compile", 0.0)
+        once = f"; compiling kernels, once, took {compiled:.0f} s" * (compiled >= 1.0)
+        self.say(f"view {step.index + 1}{when}: {census(step.graph)}{f1} ({turn(step.timings):.1f} s{once})")
         for change in noticed(before, step):
             self.say(f"  {change}")
         for line in changes(before, step):
@@ -121,5 +123,5 @@ def table(
 
 
 def turn(timings: Mapping[str, float]) -> float:
-    """Time of one turn of the loop [s]: all stages except waiting for the camera."""
-    return sum(seconds for stage, seconds in timings.items() if stage != "capture")
+    """Time of one turn of the loop [s]: all stages except waiting for the camera, and compiling kernels."""
+    return sum(seconds for stage, seconds in timings.items() if stage not in ("capture", "compile"))

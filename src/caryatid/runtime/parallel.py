@@ -24,6 +24,7 @@ from filelock import FileLock
 from numba import njit
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
+from numba.core.event import TimingListener, register
 from threadpoolctl import ThreadpoolController
 
 from caryatid.errors import InputError, check_type
@@ -33,6 +34,15 @@ Result = TypeVar("Result")
 
 log = logging.getLogger(__name__)
 """Reports that kernels are being compiled."""
+
+
+_compiling = TimingListener()
+register("numba:compile", _compiling)
+
+
+def compile_time() -> float:
+    """Time in which kernels were compiled since the program started [s]."""
+    return float(_compiling.duration) if _compiling.done else 0.0
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
