@@ -18,6 +18,7 @@ import numpy as np
 from caryatid.config import ActiveVisionConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
+from caryatid.graph import SupportGraph
 from caryatid.planning import expected_visibility as targets
 from caryatid.planning import points_of_interest as interest
 from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
@@ -50,7 +51,7 @@ class SupportPlanner:
             candidates,
             gain.sum(axis=0) + config.effort * inhibition,
             config.effort * path_cost(state)[looks.chosen],
-            lambda best: _why(samples, gain[:, best]),
+            lambda best: _why(samples, gain[:, best], state.graph),
             looks=looks,
             points=points,
             elsewhere=partial(_on_sphere, points, state.visited, sphere.directions, config),
@@ -111,8 +112,8 @@ def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[
     return points
 
 
-def _why(samples: Samples, gain: Array) -> str:
-    """One sentence: which objects a view shows more of."""
+def _why(samples: Samples, gain: Array, graph: SupportGraph) -> str:
+    """One sentence: which objects a view shows more of, and near which one it shows the most unseen space."""
     total = float(gain.sum())
     if total <= 0.0:
         return "no view is expected to show anything hidden; this one is the cheapest"
@@ -121,5 +122,18 @@ def _why(samples: Samples, gain: Array) -> str:
     for name, share in zip(samples.names, shares, strict=True):
         worth[name] = worth.get(name, 0.0) + float(share)
     ranked = sorted(worth.items(), key=lambda item: -item[1])[:3]
-    parts = [f"{name} ({share / total:.0%})" for name, share in ranked if share > WORTH_SAYING * total]
+    parts = [
+        f"{name + _near(samples, gain, graph) if name == SPACE else name} ({share / total:.0%})"
+        for name, share in ranked
+        if share > WORTH_SAYING * total
+    ]
     return "expected to reveal the most: " + ", ".join(parts)
+
+
+def _near(samples: Samples, gain: Array, graph: SupportGraph) -> str:
+    """Name the object nearest to the most of the unseen space that a view shows, as seen from above."""
+    objects = [o for o in graph.objects if o.role == "object"]
+    space = np.isin(samples.names, [SPACE])[samples.subjects]
+    offsets = samples.points_world[space, None] - np.array([o.centre_world for o in objects]).reshape(-1, 3)
+    nearest = np.linalg.norm(offsets[:, :, :2], axis=2).argmin(axis=1)
+    return f" near {objects[np.bincount(nearest, weights=gain[space]).argmax()].id}"
