@@ -22,11 +22,8 @@ from caryatid.config.stages import Config
 from caryatid.errors import WrongViewError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import UP, Array
-from caryatid.sensing.views import View
+from caryatid.sensing.views import AWAY, DEPTH_UNITS, View, describe_unit, undo_factor, undo_unit
 
-AWAY = 100.0
-"""Distance of a camera from the world's origin beyond which its pose is not in metres [m]: no room is larger,
-and a camera farther than 10 cm from the origin is beyond it in millimetres."""
 SAMPLES, TRIALS = 1500, 200
 """Numbers of pixels at which planes are looked for, and of triples that are tried [1]: 200 find a plane of a
 quarter of the pixels with confidence 0.96."""
@@ -103,11 +100,6 @@ def _transpose_rotation(T: Array) -> Array:
     return transforms.rigid(T[:3, :3].T, T[:3, 3])
 
 
-def _rescale(factor: float) -> str:
-    """Say what undoes a factor."""
-    return f"divide it by {factor:.5g}" if factor > 1.0 else f"multiply it by {1.0 / factor:.5g}"
-
-
 def _scale_translation(T: Array, factor: float) -> Array:
     return transforms.rigid(T[:3, :3], factor * T[:3, 3])
 
@@ -164,13 +156,9 @@ POSES: Mapping[str, Callable[[Array], Array]] = {
 """Combinations of them."""
 LIKELY = {*WAYS, *CAMERAS, *WORLDS, *(cause for cause in POSES if GL_AXES in cause)}
 """Those that the table alone may tell; of many, some fit by chance."""
-DEPTH_UNITS: Mapping[str, float] = {
-    "millimetres": 1e3, "centimetres": 1e2, "tenths of a millimetre": 1e4, "kilometres": 1e-3,
-}  # fmt: skip
-"""How many of the units that depth is met in make a metre [1]."""
 UNITS: Mapping[str, float] = {
     f"the translation of T_world_camera is {1.0 / factor:.4g} times as long as depth says{unit}: "
-    f"{_rescale(1.0 / factor)}, if depth is right": factor
+    f"{undo_factor(1.0 / factor)}, if depth is right": factor
     for factor, unit in {
         **dict.fromkeys((100.0, 39.37, 10.0, 5.0, 4.0, 2.0, 0.5, 0.25, 0.2), ""),
         1e3: ", as if in kilometres", 0.1: ", as if in decimetres", 0.0254: ", as if in inches",
@@ -283,10 +271,8 @@ def check_camera(view: View, max_coordinate: float) -> None:
         remedy = f"give T_world_camera in metres, in a world whose origin is within {AWAY:g} m"
         raise WrongViewError(view.name, reason, remedy)
     if float(view.depth.max(initial=0.0)) > max_coordinate:
-        unit = describe_unit(view.depth[view.valid])
-        raise WrongViewError(
-            view.name, f"depth reaches {view.depth.max():.4g} m{unit}", f"give depth in metres{_undo(unit)}"
-        )
+        remedy = "give depth in metres, and 0 where there is no reading"
+        raise WrongViewError(view.name, f"depth reaches {view.depth.max():.4g} m", remedy)
 
 
 def describe_camera(view: View) -> str:
@@ -508,7 +494,7 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         # Parts of images have their principal point anywhere.
         said = {"": "", "K": "" if level else centre}
         if unit := describe_unit(view.depth[view.valid]):
-            said["unit"] = f"depth is {near:.4g}–{far:.4g} m{unit}: give metres{_undo(unit)}"
+            said["unit"] = f"depth is {near:.4g}–{far:.4g} m{unit}: give metres{undo_unit(unit)}"
         for check in (partial(check_camera, max_coordinate=config.cloud.max_coordinate), check_depth):
             try:
                 check(view)
@@ -560,7 +546,9 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         elif best in UNITS and "unit" in usual:
             factor, length = UNITS[best], usual["unit"].partition(",")[0]
             named = {k: f" as if in {unit}," for unit, k in DEPTH_UNITS.items()}.get(factor, "")
-            usual["unit"] = f"{length},{named} {factor:.4g} times as long as by the poses: {_rescale(factor)}"
+            usual["unit"] = (
+                f"{length},{named} {factor:.4g} times as long as by the poses: {undo_factor(factor)}"
+            )
         elif best:
             usual = {key: text for key, text in usual.items() if key not in conventions} | {best: best}
         elif _have_one_pose(thin):
@@ -672,15 +660,3 @@ def _is_level_somewhere(view: View, max_tilt: float) -> bool:
 def _tilt(T_world_camera: Array, normal_camera: Array) -> float:
     """Angle [deg] between a plane's normal and the vertical."""
     return float(np.degrees(transforms.angle_between(transforms.rotate(T_world_camera, normal_camera), UP)))
-
-
-def describe_unit(readings: NDArray[np.floating]) -> str:
-    """Say in which other unit readings (N,) would be about a metre, as of a table; else ""."""
-    median, counts = float(np.median(readings)), {"": 1.0, **DEPTH_UNITS}
-    unit = min(counts, key=lambda name: abs(np.log(median / counts[name])))
-    return f", as if in {unit}" if unit else ""
-
-
-def _undo(unit: str) -> str:
-    """Say how to convert readings that `describe_unit` says something of to metres."""
-    return "".join(f": {_rescale(k)}" for name, k in DEPTH_UNITS.items() if unit.endswith(name))

@@ -24,6 +24,30 @@ SUPPORT_LABEL = 65535
 """The label of the main support surface in label images: the last of 16 bits, so that given labels stay."""
 MAX_LABEL = 65519
 """The highest label of an object; those above are of support surfaces, at most 16, downwards from 65535."""
+AWAY = 100.0
+"""What is farther is not in metres [m]: no room is larger, and depth and cameras farther than 10 cm from the
+world's origin are beyond it in millimetres."""
+DEPTH_UNITS: Mapping[str, float] = {
+    "millimetres": 1e3, "centimetres": 1e2, "tenths of a millimetre": 1e4, "kilometres": 1e-3,
+}  # fmt: skip
+"""How many of the units that depth is met in make a metre [1]."""
+
+
+def describe_unit(readings: NDArray[np.floating]) -> str:
+    """Say in which other unit readings (N,) would be about a metre, as of a table; else ""."""
+    median, counts = float(np.median(readings)), {"": 1.0, **DEPTH_UNITS}
+    unit = min(counts, key=lambda name: abs(np.log(median / counts[name])))
+    return f", as if in {unit}" if unit else ""
+
+
+def undo_unit(unit: str) -> str:
+    """Say how to convert readings that `describe_unit` says something of to metres."""
+    return "".join(f": {undo_factor(k)}" for name, k in DEPTH_UNITS.items() if unit.endswith(name))
+
+
+def undo_factor(factor: float) -> str:
+    """Say what undoes a factor."""
+    return f"divide it by {factor:.5g}" if factor > 1.0 else f"multiply it by {1.0 / factor:.5g}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +70,7 @@ class View(Pictured):
         names: What labels show, such as {3: "mug"}, or None; several may have one name.
 
     Raises:
-        InputError: Sizes differ, depth is negative or infinite, K or the pose is not valid.
+        InputError: Sizes differ, depth is negative, infinite or not in metres, K or the pose is not valid.
     """
 
     depth: NDArray[np.float32]
@@ -69,6 +93,11 @@ class View(Pictured):
         if np.isinf(depth).any() or (depth < 0.0).any():
             bad = "infinite" if np.isinf(depth).any() else "negative"
             raise InputError(name, f"depth contains {bad} values", "mark missing readings with 0 or NaN")
+        if depth.max() > AWAY and (far := float(np.median(depth[depth > 0.0]))) > AWAY:
+            unit = describe_unit(depth[depth > 0.0])
+            raise InputError(
+                name, f"depth is about {far:.4g} m{unit}", f"give depth in metres{undo_unit(unit)}"
+            )
         # Anything nearer than a micrometre is not a reading, and its inverse may be infinite.
         depth = np.where(depth < 1e-6, np.float32(0.0), depth)
         assign("depth", depth)
