@@ -154,7 +154,7 @@ def kill_session(folder: Path, views: Sequence[View], kills: int, seed: int) -> 
             paths[name].write_bytes(content)
         steps.append(["add", *(f"--{name}={path}" for name, path in paths.items()), "--number", number])
         graphs.append(graph_text(scene.update(view)))
-    for number, o in enumerate([o for o in scene.graph.objects if o.role == "object"]):
+    for number, o in enumerate(scene.graph.movable):
         steps.append(["take", o.id, "--number", number])
         graphs.append(graph_text(scene.removed(o.id)))
     known, session = len(steps), folder / "session"

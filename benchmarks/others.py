@@ -305,7 +305,7 @@ def tolerance_of(image: Labels) -> float:
 
 def without_surfaces(graph: SupportGraph) -> SupportGraph:
     """Return the objects of a graph, and the supports between them."""
-    objects = tuple(o for o in graph.objects if o.role == "object")
+    objects = graph.movable
     ids = {o.id for o in objects}
     return SupportGraph(objects, tuple(s for s in graph.supports if {*s.pair} <= ids))
 
@@ -412,7 +412,7 @@ def rests_on(bounds: Bounds) -> dict[tuple[int, int], float]:
 
 def order_by_height(graph: SupportGraph, goal: str | None = None) -> list[str]:
     """Return the objects of a graph, the highest centre first, up to a goal; all if the goal is not found."""
-    objects = [o for o in graph.objects if o.role == "object"]
+    objects = graph.movable
     ids = [o.id for o in sorted(objects, key=lambda o: -o.centre_world[2])]
     return ids[: ids.index(goal) + 1] if goal in ids else ids
 

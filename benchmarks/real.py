@@ -327,7 +327,7 @@ def score_clicks(graph: SupportGraph, labels: Labels, annotation: Annotation) ->
         labels: Label image (H, W) of the clicked frame.
         annotation: What was clicked.
     """
-    ids = {o.label: o.id for o in graph.objects if o.role == "object"}
+    ids = {o.label: o.id for o in graph.movable}
     clicks = {
         name: [label for click in points if 0 < (label := label_at(labels, *click)) <= MAX_LABEL]
         for name, points in annotation.objects.items()
@@ -402,7 +402,7 @@ def is_near(mask: NDArray[np.bool_], annotation: Annotation) -> bool:
 
 def project_shapes(outcome: Outcome) -> float:
     """Mean IoU [1] of masks with the projected shapes of their labels; 0 for those without a shape."""
-    shapes = {o.label: o for o in outcome.graph.objects if o.role == "object"}
+    shapes = {o.label: o for o in outcome.graph.movable}
     ious = []
     for view, T_world_camera in zip(outcome.views, outcome.cameras, strict=True):
         assert view.labels is not None

@@ -37,7 +37,7 @@ def main() -> None:
     scene = ct.Scene()
     graph = scene.update(cloud)
 
-    print(f"{len(cloud)} points, {len(graph.objects) - 1} objects on the table (o0)")
+    print(f"{len(cloud)} points, {len(graph.movable)} objects on the table (o0)")
     for support in graph.supports:
         print(f"  {support.supporter} supports {support.supported}: {support.why}")
     assert {support.pair for support in graph.supports} == truth

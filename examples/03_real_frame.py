@@ -32,7 +32,7 @@ def main(folder: Path) -> Score | None:
     # The table gives the frame its world: z up, the table's top at z = 0.
     scene = ct.Scene()
     graph = scene.update(view)
-    for o in graph.objects[1:]:
+    for o in graph.movable:
         supporters = " and ".join(s.supporter for s in graph.supporters(o.id)) or "something unseen"
         size = " × ".join(f"{100 * e:.0f}" for e in o.shape.extents)
         print(f"  {o.id}: {o.shape.kind} of {size} cm, supported by {supporters}")

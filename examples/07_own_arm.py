@@ -46,7 +46,7 @@ def main() -> None:
     stage = make_simulation(scene, ct.Config(), noise="carmine", seed=0, robot=arm)
     for step in ct.explore(stage.camera, stage.robot, early_stop=False):
         f1 = score(step.graph, truth, np.random.default_rng(0)).f1
-        print(f"view {step.index + 1}: {len(step.graph.objects) - 1} objects, F1 {f1:.2f}", end="")
+        print(f"view {step.index + 1}: {len(step.graph.movable)} objects, F1 {f1:.2f}", end="")
         print(f" after {step.path_travelled:.1f} m of the hand, {step.sphere.radius:.2f} m from the middle")
         if step.index == 4:
             break

@@ -152,7 +152,7 @@ def main(description: Path, settings: Path) -> None:
     arm = arms[0]
     write_reachability(f"{description.stem}.npz", arm.reach)
     for step in ct.explore(WristCamera(arm, stage.camera), stage.robot, config=config):
-        f1, found = score(step.graph, truth).f1, f"{len(step.graph.objects) - 1} objects"
+        f1, found = score(step.graph, truth).f1, f"{len(step.graph.movable)} objects"
         rest = step.stop or f"{len(step.candidates or ())} views in reach"
         print(f"view {step.index + 1} from {step.sphere.radius:.2f} m: {found}, F1 {f1:.2f}; {rest}")
     order = plan_order(step.graph, config, steps=1, reachable=arm.grasps)

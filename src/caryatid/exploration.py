@@ -112,8 +112,8 @@ class Step(Pictured):
 
     def __repr__(self) -> str:
         following = f"stop: {self.stop}" if self.decision is None else f"next: {self.decision.why}"
-        vertices, edges = len(self.graph.objects), len(self.graph.supports)
-        return f"Step(index={self.index}, vertices={vertices}, edges={edges}; {following})"
+        objects, supports = len(self.graph.movable), len(self.graph.supports)
+        return f"Step(index={self.index}, objects={objects}, supports={supports}; {following})"
 
 
 class Explorer:

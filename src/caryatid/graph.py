@@ -182,6 +182,11 @@ class SupportGraph(Pictured):
         """All support surfaces, the main one first."""
         return tuple(o for o in self.objects if o.role == "support_surface")
 
+    @property
+    def movable(self) -> tuple[SceneObject, ...]:
+        """All objects but the support surfaces."""
+        return tuple(o for o in self.objects if o.role == "object")
+
     def support(self, supporter: str, supported: str) -> Support | None:
         """Return the edge between two ids, or None.
 
@@ -210,7 +215,7 @@ class SupportGraph(Pictured):
     def __repr__(self) -> str:
         edges = [f"{s.supporter} → {s.supported}{'?' * s.doubtful}" for s in self.supports]
         told = edges if len(edges) <= 8 else [*edges[:7], "…"]
-        counts = f"vertices={len(self.objects)}, edges={len(edges)}"
+        counts = f"objects={len(self.movable)}, supports={len(edges)}"
         return f"SupportGraph({counts}{': ' if told else ''}{', '.join(told)})"
 
 

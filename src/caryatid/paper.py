@@ -83,7 +83,7 @@ class ViewScene(PaperScene):
 
     def _list_known_objects(self) -> list[SceneObject]:
         # The models have the newest view's objects alone.
-        return [o for o in self.graph.objects if o.role == "object"]
+        return list(self.graph.movable)
 
     def _find_appeared(self, observation: Observation, voxels: VoxelMap) -> dict[int, str]:
         return super()._find_appeared(observation, voxels) if self.identified else {}
@@ -104,7 +104,7 @@ class ViewScene(PaperScene):
         return observation
 
     def _surfaces(self) -> dict[str, tuple[Array, Array]]:
-        return {o.id: o.shape.surface(0.01) for o in self.graph.objects if o.role == "object"}
+        return {o.id: o.shape.surface(0.01) for o in self.graph.movable}
 
     def _match_objects(self, newest: SupportGraph, given: bool) -> dict[str, str] | None:
         if given and self.config.fusion.matching == "points":

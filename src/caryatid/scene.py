@@ -174,8 +174,8 @@ class Scene(Pictured):
         return cloud.select(self._shown_labels(cloud.labels) > 0)
 
     def __repr__(self) -> str:
-        vertices, edges = len(self.graph.objects), len(self.graph.supports)
-        return f"Scene(views={self.views}, vertices={vertices}, edges={edges})"
+        objects, supports = len(self.graph.movable), len(self.graph.supports)
+        return f"Scene(views={self.views}, objects={objects}, supports={supports})"
 
     def explain(self, supporter: str, supported: str) -> str:
         """Explain why one object supports another, or why not, with numbers.
@@ -210,7 +210,7 @@ class Scene(Pictured):
 
     def reasons(self) -> tuple[Reasons, ...]:
         """Say why each object has its shape: `why` of all that have points."""
-        known = (o.id for o in self.graph.objects if o.role == "object")
+        known = (o.id for o in self.graph.movable)
         return tuple(self.why(id_) for id_ in known if self._label_of(id_) in self._models.fits)
 
     def predict_removal(self, object_id: str) -> tuple[Effect, ...]:
@@ -393,12 +393,12 @@ class Scene(Pictured):
         for o in self.graph.objects:
             if o.id == self.graph.find_id(object_id) and o.role == "object":
                 return o
-        known = ", ".join(o.title for o in self.graph.objects if o.role == "object")
+        known = ", ".join(o.title for o in self.graph.movable)
         raise InputError(object_id, "is not an object of the graph", f"known objects: {known or 'none'}")
 
     def _labels(self) -> set[int]:
         """Labels of the objects, in the models and in the graph."""
-        own = {o.label for o in self.graph.objects if o.role == "object"}
+        own = {o.label for o in self.graph.movable}
         return {*self._models.points.objects, *own}
 
     def _free_label(self) -> int:
@@ -438,7 +438,7 @@ class Scene(Pictured):
         assert self.voxels is not None
         self._detector.report(Change(kind, object_id, self.views, "reported by the robot"))
         newest = self._inferred(self.voxels)
-        names = {o.id: self._ids.get(o.label, o.id) for o in newest.objects if o.role == "object"}
+        names = {o.id: self._ids.get(o.label, o.id) for o in newest.movable}
         newest = renamed(newest, names)
         self._graphs = (*self._graphs[:-1], newest)
         if kind != "removed":

@@ -211,7 +211,7 @@ def detections_message(make: Make, graph: SupportGraph, header: Any) -> Any:
         box = make("vision_msgs/msg/BoundingBox3D", center=pose, size=_vector(make, o.shape.extents))
         return make("vision_msgs/msg/Detection3D", header=header, id=o.id, results=[result], bbox=box)
 
-    found = [detection(o) for o in graph.objects if o.role == "object"]
+    found = [detection(o) for o in graph.movable]
     return make("vision_msgs/msg/Detection3DArray", header=header, detections=found)
 
 

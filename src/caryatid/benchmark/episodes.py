@@ -183,7 +183,7 @@ def _take_apart(
 ) -> dict[str, float]:
     """Whether taking a scene apart disturbs nothing; unextracted objects go last, highest first."""
     bodies = bodies_of(graph, truth)
-    objects = [o for o in graph.objects if o.role == "object"]
+    objects = graph.movable
     if objects and order in ("one hand", "two hands"):
         steps = list(plan_order(graph, config, hands=1 if order == "one hand" else 2, seed=seed).steps)
     else:

@@ -242,7 +242,7 @@ def write_report(
         made_by = f"caryatid {record.get('versions', {}).get('caryatid', '')}".rstrip()
         about = [record.get("conditions"), made_by, record.get("date", "")[:16].replace("T", " ")]
         order, answer = None, describe_removed(record.get("lifts", ()))
-        if len(run.graph) > len(run.graph.support_surfaces):
+        if run.graph.movable:
             try:
                 order = _plan_order(run, config, asked)
                 answer += describe_order(order, run.graph)

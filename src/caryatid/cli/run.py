@@ -231,7 +231,7 @@ def _check_goal(command: Explore | Clear, source: Source, config: Config) -> Non
 
 def _check_found(goal: str | None, last: Step) -> None:
     """Reject a goal that the last graph lacks."""
-    found = [o.title for o in last.graph.objects if o.role == "object"]
+    found = [o.title for o in last.graph.movable]
     if goal is not None and last.graph.find_id(goal) not in last.graph:
         reason = f"was not found in {count_of(last.index + 1, 'view')}"
         raise GoalError(f"--goal {goal}", reason, f"objects found: {', '.join(found) or 'none'}")

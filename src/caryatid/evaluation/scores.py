@@ -154,7 +154,7 @@ def score(
     """
     config = config or EvaluationConfig()
     rng = rng or np.random.default_rng(0)
-    found, true = [o.shape for o in graph.objects if o.role == "object"], list(truth.objects.values())
+    found, true = [o.shape for o in graph.movable], list(truth.objects.values())
     # By Monte Carlo; 10,000 points per pair: σ = 0.01 at worst.
     iou, true_bounds = np.zeros((len(found), len(true))), [_bounds(shape) for shape in true]
     for i, a in enumerate(found):
@@ -197,7 +197,7 @@ def score_masks(
     """
     config = config or EvaluationConfig()
     names = [name for name in vertices if name != TABLE]
-    found = [o.label for o in graph.objects if o.role == "object"]
+    found = [o.label for o in graph.movable]
     # Other names than `object<obj_id>` are of no object, like the label 0.
     numbered = [re.fullmatch("object([0-9]+)", name) for name in names]
     iou = mask_ious(labels, true_labels, found, [int(n[1]) if n else 0 for n in numbered])
@@ -219,7 +219,7 @@ def _matched(
 
     The true name of each matched support surface is given by its id.
     """
-    objects = [o.id for o in graph.objects if o.role == "object"]
+    objects = [o.id for o in graph.movable]
     pairs = assign(iou, min_iou)
     matches = {objects[i]: names[j] for i, j in pairs} | dict(surfaces)
     ious = {objects[i]: float(iou[i, j]) for i, j in pairs}
@@ -312,7 +312,7 @@ def as_scene(graph: SupportGraph) -> TrueScene:
     return TrueScene(
         vertices=tuple(o.id for o in graph.objects),
         edges=frozenset(s.pair for s in graph.supports),
-        objects={o.id: o.shape for o in graph.objects if o.role == "object"},
+        objects={o.id: o.shape for o in graph.movable},
         surfaces={o.id: _top_of(o.shape) for o in graph.support_surfaces},
     )
 

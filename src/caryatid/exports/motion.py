@@ -75,7 +75,7 @@ def collision_object(item: SceneObject, frame: str) -> dict[str, Any]:
 
 def _unseen_space(graph: SupportGraph, voxels: VoxelMap, frame: str) -> list[dict[str, Any]]:
     """A CollisionObject of what no view showed above surfaces, outside of objects and up to the highest."""
-    bodies = [o.shape for o in graph.objects if o.role == "object"]
+    bodies = [o.shape for o in graph.movable]
     if not bodies:
         return []
     surfaces = [o.shape for o in graph.support_surfaces]

@@ -105,7 +105,7 @@ def _lift(
 ) -> tuple[TakeStep | None, str | None]:
     """The object to remove now, or None to look again; and why this is the last view, or None."""
     scene = explorer.scene
-    ids = [o.id for o in scene.graph.objects if o.role == "object"]
+    ids = [o.id for o in scene.graph.movable]
     if not ids and goal is None:
         return None, "no objects are left"
     lift, missing, found = None, f"{goal} was not found", goal is None or goal in ids

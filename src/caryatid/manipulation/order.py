@@ -310,7 +310,7 @@ class _Rehearsal:
     ) -> None:
         if graph.support_surface is None:
             raise InputError("graph", "has no support surface", "give a graph with a table")
-        self.ids = tuple(o.id for o in graph.objects if o.role == "object")
+        self.ids = tuple(o.id for o in graph.movable)
         if not self.ids:
             raise InputError("graph", "has no objects to remove", "give a graph with objects")
         # Objects whose bounds, seen from above, are nearer than this gap form a group: a lift that moves no

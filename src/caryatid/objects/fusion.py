@@ -252,7 +252,7 @@ def changed(before: SupportGraph, after: SupportGraph, config: FusionConfig) -> 
         return True
     if {s.pair for s in before.supports} != {s.pair for s in after.supports}:
         return True
-    return any(reshaped(earlier[o.id], o, config) for o in after.objects if o.role == "object")
+    return any(reshaped(earlier[o.id], o, config) for o in after.movable)
 
 
 def reshaped(before: SceneObject, after: SceneObject, config: FusionConfig) -> bool:

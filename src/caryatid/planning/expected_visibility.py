@@ -73,7 +73,7 @@ def surface_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
     Every object weighs the same, small or large: each is one vertex of the graph. Points that touch another
     shape or a support surface can never be seen and are left out.
     """
-    objects = [o for o in graph.objects if o.role == "object"]
+    objects = graph.movable
     size = occluders.voxels.config.size
     x, y, z = np.array([o.shape.extents for o in objects]).reshape(-1, 3).T
     areas = 2.0 * (x * y + y * z + z * x)
@@ -131,7 +131,7 @@ def bases_of(graph: SupportGraph) -> dict[str, SceneObject]:
 
     Objects over none count as over the main one; without support surfaces, the dict is empty.
     """
-    surfaces, objects = graph.support_surfaces, [o for o in graph.objects if o.role == "object"]
+    surfaces, objects = graph.support_surfaces, graph.movable
     if not surfaces or not objects:
         return {}
     low, high = Primitives.of([o.shape for o in objects]).bounds()
@@ -259,7 +259,7 @@ def matter(samples: Samples, graph: SupportGraph, goal: str | None) -> NDArray[n
     if not _knows(goal, graph):
         return np.ones(len(samples.weights), dtype=np.bool_)
     ids = relevant(graph, goal)
-    outlines = [o.shape.footprint() for o in graph.objects if o.role == "object" and o.id in ids]
+    outlines = [o.shape.footprint() for o in graph.movable if o.id in ids]
     near = shapely.contains_xy(shapely.Polygon(hull(np.concatenate(outlines))), samples.points_world[:, :2])
     about, space = (np.isin(samples.names, names)[samples.subjects] for names in ([*ids], [SPACE]))
     return about | (space & near)

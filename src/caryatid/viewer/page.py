@@ -315,7 +315,7 @@ class Page:
         """Place the initial viewpoint in front of the objects, beside the first camera."""
         x, y = step.visited[0][:2] if len(step.visited) else (-1.0, 0.0)
         azimuth = float(np.arctan2(y + 0.5 * x, x - 0.5 * y))
-        outlines = [item.shape.outline() for item in step.graph.objects if item.role == "object"]
+        outlines = [item.shape.outline() for item in step.graph.movable]
         points = np.concatenate(outlines or [step.sphere.centre_world[None]])
         low, high = points.min(axis=0), points.max(axis=0)
         centre, reach = (low + high) / 2.0, max(float(np.linalg.norm(high - low)) / 2.0, 0.15)
@@ -402,7 +402,7 @@ class Page:
             self._about.visible = bool(chosen)
             self._plan.disabled = self._busy
             self._play.disabled = self._busy or order is None or not order.steps
-            goals = (ALL, *(o.id for o in steps[-1].graph.objects if o.role == "object"))
+            goals = (ALL, *(o.id for o in steps[-1].graph.movable))
             if self._goal.options != goals:
                 self._goal.options = goals
             for panel, text in texts:

@@ -72,7 +72,7 @@ def layers(graph: SupportGraph) -> dict[str, int]:
         support.pair[::-1] if support.kind == "top-down" else support.pair
         for support in sorted(graph.supports, key=lambda s: rank[s.kind] + s.doubtful)
     ]
-    pairs += [(s.id, o.id) for s in graph.support_surfaces for o in graph.objects if o.role == "object"]
+    pairs += [(s.id, o.id) for s in graph.support_surfaces for o in graph.movable]
     for below, above in pairs:
         if not nx.has_path(order, above, below):
             order.add_edge(below, above)

@@ -79,7 +79,7 @@ def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
     import trimesh
     from trimesh.viewer.notebook import scene_to_html
 
-    found = [item for item in graph.objects if item.role == "object"] or graph.objects
+    found = graph.movable or graph.objects
     points = np.concatenate([item.shape.outline() for item in found])
 
     def shown(item: SceneObject) -> SceneObject:

@@ -186,7 +186,7 @@ def count_of(number: int, name: str) -> str:
 def census(graph: SupportGraph) -> str:
     """Count the objects and supports of a graph."""
     surfaces, doubtful = len(graph.support_surfaces), sum(s.doubtful for s in graph.supports)
-    objects = count_of(sum(o.role == "object" for o in graph.objects), "object")
+    objects = count_of(len(graph.movable), "object")
     on = f" on {surfaces} support surfaces" if surfaces > 1 else ""
     text = f"{objects}{on}, {count_of(len(graph.supports), 'support')}"
     return f"{text}, {doubtful} of them doubtful" if doubtful else text
@@ -257,7 +257,7 @@ def describe(graph: SupportGraph) -> str:
             role = "support surface"
         lines.append(f"- {item.title}: {item.shape.kind} {size_of(item.shape)}, {role}")
     holding = {s.supporter for s in graph.supports}
-    free = [o.title for o in graph.objects if o.role == "object" and o.id not in holding]
+    free = [o.title for o in graph.movable if o.id not in holding]
     lines.append(f"support nothing (`caryatid order` rehearses lifting them): {', '.join(free) or 'none'}")
     doubtful = [f"- {lead}: {reason}" for lead, reason, _ in doubts(graph)]
     return "\n".join([*lines, f"doubtful: {'' if doubtful else 'nothing'}".rstrip(), *doubtful]) + "\n"

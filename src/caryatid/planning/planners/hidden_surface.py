@@ -132,7 +132,7 @@ def _why(samples: Samples, gain: Array, graph: SupportGraph) -> str:
 
 def _near(samples: Samples, gain: Array, graph: SupportGraph) -> str:
     """Name the object nearest to the most of the unseen space that a view shows, as seen from above."""
-    objects = [o for o in graph.objects if o.role == "object"]
+    objects = graph.movable
     space = np.isin(samples.names, [SPACE])[samples.subjects]
     offsets = samples.points_world[space, None] - np.array([o.centre_world for o in objects]).reshape(-1, 3)
     nearest = np.linalg.norm(offsets[:, :, :2], axis=2).argmin(axis=1)
