@@ -327,9 +327,6 @@ def test_the_command_writes_tables_figures_and_pages_of_finished_episodes(tmp_pa
         lines = list(csv.DictReader(file))
     assert [float(line["f1"]) for line in lines if line["f1"]] == known
     assert lines[-1]["error"].endswith("fell <over>")
-    parquet = pd.read_parquet(out / "planners.parquet")
-    assert list(parquet.columns) == list(lines[0])
-    assert parquet["f1"].dropna().tolist() == known
     assert run_command("benchmark", "--out", out, "--reference", "nobody") == 1
     assert "unknown method; choose one of support, random, oracle" in capsys.readouterr().err
 

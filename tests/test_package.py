@@ -133,7 +133,7 @@ MODULES = {
     "rerun": ["rerun"],
     "foxglove": ["foxglove"],
     "learn": ["gymnasium"],
-    "benchmark": ["pandas", "pyarrow"],
+    "benchmark": ["pandas"],
 }
 
 BLOCKED = """

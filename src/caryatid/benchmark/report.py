@@ -16,7 +16,6 @@ import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -204,14 +203,10 @@ def check_reference(reference: str | None, store: ResultStore) -> None:
 
 
 def _write_tables(store: ResultStore, folder: Path) -> None:
-    """Write the rows of each suite as `SUITE.csv` and, where pyarrow is installed, `SUITE.parquet`."""
+    """Write the rows of each suite as `SUITE.csv`."""
     for name in store.suites:
         table = store.table(name).drop(columns="forecasts")
         table.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
-        if find_spec("pyarrow") is not None:
-            table.to_parquet(folder / f"{name}.parquet", index=False)
-    if find_spec("pyarrow") is None:
-        logging.getLogger(__name__).info('no Parquet without pyarrow: pip install "caryatid[benchmark]"')
 
 
 def write_results(results: Sequence[SuiteResult], about: dict[str, str], path: Path) -> None:
