@@ -535,10 +535,6 @@ class PhysicsConfig:
     """Displacement above which an object has moved [m]."""
     turned: Angle = 8.0
     """Rotation above which an object has moved [deg]."""
-    max_copies: Count = 1000
-    """Maximum number of copies of one element of an MJCF file [1]; 1,000 settle in 4 s."""
-    max_cells: Most = 4_000_000
-    """Maximum number of height field cells or texture pixels in an MJCF file [1]: 0.2 GB."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

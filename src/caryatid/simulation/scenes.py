@@ -5,13 +5,10 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Mapping
-from contextlib import suppress
 from difflib import get_close_matches
-from math import prod
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Final, cast
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -107,12 +104,6 @@ SCENE_FILE = "scene.xml"
 TRUTH_FILE = "gt.json"
 """Name of the ground truth beside it."""
 
-_COPIES = ("replicate", "composite", "flexcomp")
-_SIZED: Final[Mapping[str, tuple[str, ...]]] = {
-    "hfield": ("nrow", "ncol"), "texture": ("width", "height"), **dict.fromkeys(_COPIES, ("count",))
-}  # fmt: skip
-"""Elements of MJCF that may take much memory → the attributes that say how much."""
-
 _GENERATED = re.compile(rf"({'|'.join(SIZES)})-(\d+)-(\d+)")
 
 
@@ -157,7 +148,6 @@ def load_scene(
     if path.suffix.lower() != ".xml" or not path.is_file():
         remedy = f"give an .xml file or a folder with a {SCENE_FILE}; {listed}"
         raise InputError(path, "not an MJCF file", remedy)
-    _check_sizes(path, config or PhysicsConfig())
     try:
         with world.mujoco_warnings_ignored():
             spec = mujoco.MjSpec.from_file(str(path))
@@ -183,24 +173,6 @@ def load_scene(
     if not scene.at_rest:
         log.warning("%s: the scene still moves; its ground truth may change between views", path)
     return scene
-
-
-def _check_sizes(path: Path, config: PhysicsConfig) -> None:
-    """Refuse a file that would exhaust memory when MuJoCo expands it: too many copies, too large fields."""
-    copies = [1.0]
-    # MuJoCo itself refuses bad XML and numbers, and names the line.
-    with suppress(ElementTree.ParseError, ValueError, OSError):
-        for event, element in ElementTree.iterparse(path, ("start", "end")):
-            if event == "end":
-                copies.pop()
-                continue
-            many, asked = element.tag in _COPIES, _SIZED.get(element.tag, ())
-            size = prod(float(word) for name in asked for word in element.get(name, "1").split())
-            copies.append(copies[-1] * size if many else copies[-1])
-            size, most = (copies[-1], config.max_copies) if many else (size, config.max_cells)
-            if size > most:
-                reason = f"its {element.tag} has {size:.4g} elements, more than {most}"
-                raise InputError(path, reason, "make it smaller")
 
 
 def list_scenes() -> dict[str, str]:
