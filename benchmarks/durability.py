@@ -3,7 +3,7 @@
     python benchmarks/durability.py [--only runs load] [--kills 200] [--views 1000] [--clients 50]
 
 `session add`, `session take` and `serve` are killed; after each kill, the session is opened and its graph is
-compared with that of the same events without a kill. `explore`, `extract`, `clear` and `benchmark` are killed
+compared with that of the same events without a kill. `explore`, `extract` and `benchmark` are killed
 too: their output stays whole, and the next run continues or replaces it and cleans up.
 Then clients, some of them hostile, put load on a service. An `AssertionError` says what was lost.
 """
@@ -270,31 +270,6 @@ def seed_of(folder: Path) -> int:
     return int(found.record["seed"])
 
 
-def kill_clearing(folder: Path, _: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `clear` at random moments; the same command continues, and ends as it does without a kill."""
-    chance, tally, said = random.Random(seed), Counter[str](), folder / "said"
-    words = ["clear", "tower", "--no-report", "--hands", 1, "--quiet", *SMALL, "--out"]
-    begun = time.monotonic()
-    stop(start([*words, folder / "whole"], said), said, None)
-    took, whole = time.monotonic() - begun, read_run(folder / "whole")
-    out, known = folder / "runs" / "run", 0
-    while tally["killed"] < kills:
-        exited = stop(start([*words, out], said), said, chance.uniform(0.0, 0.6) * took)
-        tally["exited" if exited else "killed"] += 1
-        run = read_run(out) if out.exists() else None
-        found, ended = (len(run.views), "unfinished" not in run.record) if run else (0, False)
-        assert found >= known, "stored views are lost"
-        assert ended or not exited, "the run of a command that has exited is unfinished"
-        known = found
-        if ended:
-            assert os.listdir(out.parent) == ["run"], "other files remain after the run"
-            assert read_run(out).record["lifts"] == whole.record["lifts"], "the lifts differ"
-            # The result was printed, so the same command would begin a new run.
-            tally["ended"] += 1
-            out, known = folder / f"runs-{tally['ended']}" / "run", 0
-    return tally
-
-
 def kill_benchmark(folder: Path, _: Sequence[View], kills: int, seed: int) -> Counter[str]:
     """Kill a benchmark and its workers at random moments; finished episodes are kept, and none runs twice."""
     chance, tally, out, known = random.Random(seed), Counter[str](), folder / "out", 0
@@ -411,7 +386,6 @@ KILLS: dict[str, Callable[[Path, Sequence[View], int, int], Counter[str]]] = {
     "session": kill_session,
     "serve": kill_serving,
     "runs": kill_runs,
-    "clear": kill_clearing,
     "benchmark": kill_benchmark,
 }
 

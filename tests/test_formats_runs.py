@@ -174,13 +174,6 @@ def test_a_folder_that_holds_what_no_run_wrote_is_never_touched(tmp_path, name):
     assert [p.name for p in tmp_path.iterdir()] == ["thesis"]
 
 
-def test_a_continued_run_keeps_its_scores(tmp_path):
-    RunWriter(tmp_path / "RUN", Config(), ABOUT, stepwise=True).add(step(), scored(0.25))  # then it is killed
-    with RunWriter(tmp_path / "RUN", Config(), ABOUT, stepwise=True) as run:
-        run.add(step(2), scored(0.5))
-    assert read_run(tmp_path / "RUN").record["scores"] == [scored(0.25), scored(0.5)]
-
-
 def test_files_and_empty_folders_in_the_way(tmp_path):
     (tmp_path / "file").write_text("kept")
     with pytest.raises(InputError, match="not a directory"):

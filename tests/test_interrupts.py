@@ -75,37 +75,12 @@ def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment, number):
     assert len(run.record["scores"]) == len(run.views)
 
 
-def test_a_clearing_that_is_killed_goes_on(tmp_path, scene_file):
-    quick = ["--views", 4, "--risk", 0.5, "--set", "rehearsal.draws=2", *SMALL]
-    words = ["clear", scene_file, "--no-report", "--hands", 1, *quick]
-    assert run_command(*words, "--out", tmp_path / "whole", "--quiet") == 0
-    whole, folder = read_run(tmp_path / "whole"), tmp_path / "runs" / "run"
-    folder.parent.mkdir()
-    for kills, moment in enumerate(["view 1:", "removed", "removed"]):
-        command = Command(*words, "--out", folder)
-        command.wait_for(moment)
-        kept = read_run(folder)
-        command.kill()
-        assert len(read_run(folder).views) >= len(kept.views) > kills, "what was said is there"
-    assert run_command(*words, "--out", folder, "--quiet") == 0
-    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
-    assert {p.relative_to(folder) for p in folder.rglob("*")} == {
-        p.relative_to(whole.folder) for p in whole.folder.rglob("*")
-    }
-    run = read_run(folder)
-    for key in ("lifts", "angle_travelled", "path_travelled", "views"):
-        assert run.record[key] == whole.record[key]
-    for view, known in zip(run.views, whole.views, strict=True):
-        for name in ("graph.json", "view.json", "labels.png"):
-            assert (view.folder / name).read_bytes() == (known.folder / name).read_bytes()
-
-
-def test_an_interrupted_clearing_says_how_it_goes_on(tmp_path, scene_file):
+def test_a_clearing_keeps_its_views(tmp_path, scene_file):
     command = Command("clear", scene_file, "--out", tmp_path / "run", *SMALL)
     command.wait_for("view 2:")
     status, out, told = command.interrupt()
     assert (status, out) == (130, "")
-    assert f"views are kept in {tmp_path / 'run'}; run the same command to continue" in told
+    assert f"views are kept in {tmp_path / 'run'}; `caryatid report" in told
 
 
 def test_what_reads_only_ends_at_once_and_leaves_nothing(tmp_path, scene_file):

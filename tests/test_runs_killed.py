@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,10 +14,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import durability
 from durability import seed_of
-
-from caryatid.cli.output import Output
-from caryatid.io.graph_json import graph_text
-from caryatid.steps import read_run
 
 pytestmark = pytest.mark.slow
 
@@ -65,38 +60,3 @@ def test_killed_while_it_gives_way(tmp_path, scene_file, steps, found):
 def test_killed_at_any_moment(tmp_path):
     tally = durability.kill_runs(tmp_path, durability.views_around("tower", 2), kills=12, seed=0)
     assert tally["killed"]
-
-
-def test_however_a_clearing_is_killed_the_same_command_continues(tmp_path, scene_file, monkeypatch):
-    """Keep what a kill would leave before each file appears, and before and after the result is printed."""
-    folder, left = tmp_path / "run", []
-    words = ["clear", scene_file, "--views", 2, "--risk", 0.5, "--set=rehearsal.draws=2", *SMALL, "--quiet"]
-
-    def keep_before(owner, name):
-        known = getattr(owner, name)
-
-        def step(*arguments, **options):
-            if folder.exists():
-                left.append(shutil.copytree(folder, tmp_path / f"left-{len(left)}"))
-            return known(*arguments, **options)
-
-        monkeypatch.setattr(owner, name, step)
-
-    keep_before(Path, "replace")
-    keep_before(Output, "result")
-    assert run_command(*words, "--out", folder) == 0
-    monkeypatch.undo()
-    whole, views = read_run(folder), 1
-    for each in left:
-        run = read_run(each)
-        assert run.record["unfinished"]
-        assert views <= len(run.views) <= views + 1
-        views = len(run.views)
-        assert graph_text(run.graph) == graph_text(run.views[-1].graph)
-    assert views == len(whole.views) > 2
-    assert "unfinished" not in whole.record
-    assert run_command(*words, "--out", left[-1]) == 0
-    again = read_run(left[-1])
-    assert "unfinished" not in again.record
-    for name in ("steps", "lifts"):  # the times in `steps` show that no view was taken again
-        assert again.record[name] == whole.record[name]

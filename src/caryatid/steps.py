@@ -65,11 +65,8 @@ class RunWriter(StagedFolder):
         folder: RUN.
         config: All settings.
         about: Further entries of run.json: command, source, seed, options.
-        stepwise: Publish the folder with the first view and add view by view, so that a kill keeps the views
-            so far. The end of the block finishes the run; an unfinished one is continued.
 
     Attributes:
-        past: The run that this one continues, or None.
         steps: Entries of run.json for each view: its number, its timings [s], angle and path so far.
         more: More entries of run.json.
         files: Further files of the folder: path in it → content.
@@ -78,21 +75,14 @@ class RunWriter(StagedFolder):
         InputError: RUN holds something else, or cannot be written.
     """
 
-    def __init__(
-        self, folder: str | Path, config: Config, about: Mapping[str, Any], *, stepwise: bool = False
-    ) -> None:
+    def __init__(self, folder: str | Path, config: Config, about: Mapping[str, Any]) -> None:
         self._about = json.loads(json_text(dict(about) | {"settings": asdict(config)}))
-        self.past = _unfinished(Path(folder), self._about) if stepwise else None
-        super().__init__(
-            folder, own=lambda place: OWN_FILES if is_run(place) else None, published=self.past is not None
-        )
-        record = {} if self.past is None else self.past.record
-        self._date: str = record.get("date") or datetime.now(UTC).isoformat(timespec="seconds")
-        self.steps: list[dict[str, Any]] = [*record.get("steps", ())]
-        self._scores: list[Mapping[str, Any]] = [*record.get("scores", ())]
+        super().__init__(folder, own=lambda place: OWN_FILES if is_run(place) else None)
+        self._date = datetime.now(UTC).isoformat(timespec="seconds")
+        self.steps: list[dict[str, Any]] = []
+        self._scores: list[Mapping[str, Any]] = []
         self.more: dict[str, Any] = {}
         self.files: dict[str, bytes] = {}
-        self._stepwise = stepwise
 
     def add(self, step: Step, score: Mapping[str, Any] | None = None) -> None:
         """Write the next view, or the newest one again with its `stop`.
@@ -127,24 +117,20 @@ class RunWriter(StagedFolder):
         self.steps.append({"view": step.index} | {name: getattr(step, name) for name in names})
         self._scores += [] if score is None else [score]
         self.files["graph.json"] = graph
-        if self._stepwise:
-            self._finish({"unfinished": True})
 
     def __exit__(self, kind: object = BaseException, *error: object) -> None:
-        """Write the rest and publish the folder; after an error, remove what is not published."""
+        """Write the rest and publish the folder; after an error, remove what was written."""
         interrupted = kind is KeyboardInterrupt and len(self.steps) > 0
         try:
             if kind in (None, GoalError) and self.steps:
                 self._finish({})
-            elif interrupted and not self._stepwise:
+            elif interrupted:
                 self._finish({"interrupted": True})
         finally:
             super().__exit__()
         if interrupted:
             count = "1 view is" if len(self.steps) == 1 else f"{len(self.steps)} views are"
             remedy = f"`caryatid report {self.folder}` writes the report"
-            if self._stepwise:
-                remedy = "run the same command to continue"
             raise KeyboardInterrupt(f"{count} kept in {self.folder}; {remedy}") from None
 
     def _finish(self, more: dict[str, Any]) -> None:
@@ -324,14 +310,6 @@ def _exists(folder: Path) -> bool:
     if not folder.is_dir():
         recover(folder)
     return folder.is_dir()
-
-
-def _unfinished(folder: Path, about: Mapping[str, Any]) -> Run | None:
-    """The unfinished run in a folder if it has the same command and settings, or None."""
-    if not is_run(folder):
-        return None
-    record = read_json(folder / "run.json")
-    return read_run(folder) if record.get("unfinished") and about.items() <= record.items() else None
 
 
 def _view_folder(index: int) -> str:

@@ -136,7 +136,7 @@ class Clear(options.LiftingCommand, options.ExploringCommand, work="run:clear_ta
     """Clear a simulated table: look until the next lift is safe, remove the object, look again.
 
     Objects are lifted straight up, one by one. A lift disturbs another object if it moves that object by
-    more than 2 cm or 15°. If interrupted, run the same command to continue.
+    more than 2 cm or 15°.
 
     Usage examples:
       caryatid clear bridge
@@ -147,7 +147,7 @@ class Clear(options.LiftingCommand, options.ExploringCommand, work="run:clear_ta
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Built-in or MJCF scene."""
     out: options.OutPath = Path("run")
-    """Run folder to write, view by view; replaces an existing run, or continues it if interrupted."""
+    """Run folder to write; replaces an existing run."""
     views: Annotated[options.Count | None, options.default_of("active.max_views")] = None
     """Maximum number of views before each lift."""
     no_report: options.Flag = False

@@ -131,38 +131,34 @@ def clear_table(command: Clear) -> int:
     explorer = Explorer(
         camera, source.robot, planner=command.chosen_planner, config=config, masks=masks, **command.looking
     )
-    with RunWriter(command.out, config, _about(command), stepwise=True) as writer:
+    with RunWriter(command.out, config, _about(command)) as writer:
         lifts = RecordedLifts(writer, explorer, camera, config)
-        if writer.past is not None:
-            output.say(f"{command.source}: continuing after view {len(writer.past.views)}")
         steps = clear(
-            explorer, lifts.take, goal=command.goal, hands=command.hands, threads=cores(),
-            reachable=reachable, past=() if writer.past is None else read_steps(writer.past),
-        )  # fmt: skip
+            explorer, lifts.take, goal=command.goal, hands=command.hands, threads=cores(), reachable=reachable
+        )
         last = _record(command, writer, source.name, steps)
-        # The run stays unfinished until its result is printed, so that after a kill the command continues.
-        _draw_report(command)
-        if not lifts.done:
-            _check_found(command.goal, last)
-        left, harmed = lifts.hands.left, sorted({body for lift in lifts.done for body in lift["disturbed"]})
-        success = not harmed and (last.stop == f"{command.goal} is removed" if command.goal else not left)
-        taken = [{name: value for name, value in lift.items() if name != "state"} for lift in lifts.done]
-        document = {"run": str(command.out), "success": success, "stop": last.stop, "views": last.index + 1}
-        document |= {"steps": taken, "left": left, "warnings": output.warnings}
-        rows = [
-            (str(number), lift["object"], lift["body"] or "nothing there", ", ".join(lift["held"]) or "–",
-             ", ".join(lift["disturbed"]) or "–", lift["why"])
-            for number, lift in enumerate(taken, start=1)
-        ]  # fmt: skip
-        outcome = f"{', '.join(harmed)} disturbed" if harmed else "nothing disturbed"
-        name = f"{source.name} {config.gripper.title}".strip()
-        title = f"{name}: {last.stop}; {count_of(last.index + 1, 'view')}, {outcome}"
-        output.result(document, table(title, ("step", "remove", "body", "hold", "disturbed", "reason"), rows))
-        return 0 if success else NOT_SAFE
+    _draw_report(command)
+    if not lifts.done:
+        _check_found(command.goal, last)
+    left, harmed = lifts.hands.left, sorted({body for lift in lifts.done for body in lift["disturbed"]})
+    success = not harmed and (last.stop == f"{command.goal} is removed" if command.goal else not left)
+    taken = [{name: value for name, value in lift.items() if name != "state"} for lift in lifts.done]
+    document = {"run": str(command.out), "success": success, "stop": last.stop, "views": last.index + 1}
+    document |= {"steps": taken, "left": left, "warnings": output.warnings}
+    rows = [
+        (str(number), lift["object"], lift["body"] or "nothing there", ", ".join(lift["held"]) or "–",
+         ", ".join(lift["disturbed"]) or "–", lift["why"])
+        for number, lift in enumerate(taken, start=1)
+    ]  # fmt: skip
+    outcome = f"{', '.join(harmed)} disturbed" if harmed else "nothing disturbed"
+    name = f"{source.name} {config.gripper.title}".strip()
+    title = f"{name}: {last.stop}; {count_of(last.index + 1, 'view')}, {outcome}"
+    output.result(document, table(title, ("step", "remove", "body", "hold", "disturbed", "reason"), rows))
+    return 0 if success else NOT_SAFE
 
 
 class RecordedLifts:
-    """Lifts in a simulation, recorded in a run folder; those of an unfinished run come first.
+    """Lifts in a simulation, recorded in a run folder.
 
     Attributes:
         hands: Hands that lift.
@@ -175,20 +171,14 @@ class RecordedLifts:
         self._writer, self._explorer, self._camera, self._config = writer, explorer, camera, config
         self.hands = SimulatedHands(camera.scene, config)
         self.done: list[dict[str, Any]] = []
-        if writer.past is not None:
-            self.done = writer.past.record["lifts"]
-            camera.captures = len(writer.past.views)
         writer.more["lifts"] = self.done
-        if self.done:
-            self.hands.state = np.array(self.done[-1]["state"])
-            camera.scene = self.hands.scene
 
     def take(self, step: TakeStep) -> bool:
         """Remove an object, and return whether it was in place."""
         writer, robot, graph = self._writer, self._explorer.robot, self._explorer.scene.graph
         taken = self.hands.take(step, self.hands.bodies(graph))
         state = plain(self.hands.state)
-        self.hands.state = np.array(state)  # as it comes back from the file
+        self.hands.state = np.array(state)  # as `evaluate` reads it
         self._camera.scene = self.hands.scene
         self.done.append({"view": len(writer.steps)} | taken.to_json() | {"state": state})
         if taken.body is not None and robot is not None:

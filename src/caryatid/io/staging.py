@@ -32,42 +32,33 @@ LATER: Final = "delete this line and all later ones"
 class StagedFolder:
     """A staged folder, to be used in a `with` block.
 
-    Files are written into a hidden sibling `.partial-NAME-…`, which `publish` renames to its place. Files
-    written later go straight there. Leaving the block without `publish` removes the files written, and parent
-    folders made for them.
+    Files are written into a hidden sibling `.partial-NAME-…`, which `publish` renames to its place. Leaving
+    the block without `publish` removes the files written, and parent folders made for them.
 
     Args:
         folder: The folder's final place.
         own: Returns the pattern of the files in an existing folder that may be replaced, or None; a folder
             with any other file does not change.
-        published: The folder is already in its place, and files are added to it.
 
     Attributes:
         folder: The folder's final place.
-        published: Whether it is in its place.
 
     Raises:
         InputError: The place holds something that may not be replaced, or cannot be written.
     """
 
     def __init__(
-        self,
-        folder: str | Path,
-        *,
-        own: Callable[[Path], re.Pattern[str] | None] | None = None,
-        published: bool = False,
+        self, folder: str | Path, *, own: Callable[[Path], re.Pattern[str] | None] | None = None
     ) -> None:
         self.folder = Path(folder)
-        self.published = published
         self._place = Path(os.path.realpath(self.folder))  # unlike `resolve`, takes a link to itself
         self._own = own
         self._partial = _partial(self._place)
         recover(self._place)
         self._made = [parent for parent in self._place.parents if not parent.exists()]
-        if not published:
-            self._check_place()
-            with write_errors(self.folder):
-                self._partial.mkdir(parents=True)
+        self._check_place()
+        with write_errors(self.folder):
+            self._partial.mkdir(parents=True)
 
     def __enter__(self) -> Self:
         return self
@@ -85,22 +76,17 @@ class StagedFolder:
         Raises:
             InputError: The disk cannot be written.
         """
-        path = (self._place if self.published else self._partial) / name
+        path = self._partial / name
         with write_errors(self.folder):
             path.parent.mkdir(parents=True, exist_ok=True)
-            if self.published:
-                write_file(path, content)
-            else:
-                path.write_bytes(content)
+            path.write_bytes(content)
 
     def publish(self) -> None:
-        """Publish the folder, unless it is published; an older one is replaced if that is allowed.
+        """Publish the folder; an older one is replaced if that is allowed.
 
         Raises:
             InputError: The place has been taken meanwhile, or cannot be written.
         """
-        if self.published:
-            return
         self._check_place()
         old = self._partial.with_name(f"{self._partial.name}{REPLACED}")
         with write_errors(self.folder):
@@ -112,7 +98,6 @@ class StagedFolder:
                 if old.exists():
                     old.rename(self._place)
                 raise
-        self.published = True
         shutil.rmtree(old, ignore_errors=True)
 
     def _check_place(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,7 +32,6 @@ def clear(
     hands: int = 1,
     threads: int = 1,
     reachable: Reachable | None = None,
-    past: Iterable[Step] = (),
 ) -> Iterator[Step]:
     """Look until the next lift is safe, lift, and repeat until no object or no safe lift is left.
 
@@ -51,27 +50,16 @@ def clear(
         hands: 2 if another hand can hold one object, else 1.
         threads: Number of parallel rehearsals.
         reachable: Which gripper poses (N, 4, 4), in the world frame, the arm reaches; None = all.
-        past: Steps of a run to continue; their views are reused, and nothing is removed again.
 
     Yields:
         A step after each view and its lift; `lift` names the removed object, which the graph holds until the
         next view, or not if there is none. The last one again, with `stop`, if the robot can go to no further
-        view, or if it is the last of `past`.
+        view.
 
     Raises:
         CaryatidError: A view cannot be used.
     """
     views = missed = 0
-    for step in past:  # repeat its view, and remove the object of its lift
-        if explorer.step is not None:
-            explorer.go()
-        explorer.look(step.view)
-        if step.lift is not None:
-            explorer.scene.removed(step.lift.object_id)
-        explorer.step = step
-        views = 0 if step.lift is not None else views + 1
-    if explorer.step is not None and explorer.step.decision is None:
-        yield explorer.step
     while explorer.step is None or explorer.step.decision is not None:
         if explorer.step is not None and (step := explorer.go()).stop is not None:
             yield step
