@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from importlib.metadata import EntryPoint
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +11,6 @@ from arms import SLIDES, assert_gaze, gantry, within_arms_length
 from conftest import SMALL, run_command
 from synthetic import shelf_graph, surface_at, surface_object
 
-from caryatid import robots
 from caryatid.config import ActiveVisionConfig, ArmConfig, Config, RobotConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.geometry import transforms
@@ -210,20 +208,12 @@ def test_the_humanoid_and_an_arm_are_found_by_name(surroundings, map_file):
     np.testing.assert_allclose(arm.T_world_base[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
 
 
-def test_a_robot_of_another_package_is_found_by_its_entry_point(surroundings, monkeypatch):
-    point = EntryPoint("mine", "test_robots:make_arm", robots.ENTRY_POINTS)
-    monkeypatch.setattr(robots, "entry_points", lambda group: [point] if group == point.group else [])
-    assert isinstance(find_robot("mine")(surroundings), ArmRobot)
-    with pytest.raises(InputError, match=r"choose one of humanoid, mine, arm:FILE\.npz, module:callable"):
-        find_robot("yours")
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
         ("no.such.module:arm", "'no.such.module:arm' cannot be imported"),
         ("test_robots:nothing", "cannot be imported .*nothing"),
-        ("test_robots:", "cannot be imported"),
+        ("yours", r"choose one of humanoid, arm:FILE\.npz, module:callable"),
         ("arm:no-such.npz", r"no-such\.npz: the file is missing"),
     ],
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from caryatid.sensing.view_sphere import ViewSphere, direction
 
 __all__ = [
     "OwnViews", "Posture", "Robot", "RobotMaker", "Surroundings", "Unreachable", "find_robot", "go_home",
-    "located", "offered", "view_sphere_of", "way_to",
+    "located", "view_sphere_of", "way_to",
 ]  # fmt: skip
 
 HUMANOID = "humanoid"
@@ -31,9 +31,6 @@ HUMANOID = "humanoid"
 
 ARM = "arm:"
 """Prefix of a name that ends with the file of a reachability map."""
-
-ENTRY_POINTS = "caryatid.robots"
-"""Group of entry points of other packages' robots: callables that make one for `Surroundings`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -62,13 +59,8 @@ RobotMaker = Callable[[Surroundings], Robot]
 """Makes a robot that stands in such surroundings."""
 
 
-def offered() -> dict[str, EntryPoint]:
-    """Robots of other packages by name; they cannot replace the humanoid."""
-    return {r.name: r for r in entry_points(group=ENTRY_POINTS) if r.name != HUMANOID}
-
-
 def find_robot(name: str) -> RobotMaker:
-    """Return the maker of a robot: `humanoid`, `module:callable`, or a name that another package offers.
+    """Return the maker of a robot: `humanoid`, or `module:callable`.
 
     `arm:FILE.npz` is an arm by its file of `write_reachability`.
 
@@ -84,16 +76,14 @@ def find_robot(name: str) -> RobotMaker:
         return lambda around: ArmRobot(
             reachability, around.T_world_base, around.config.arm, furniture=around.floor
         )
-    others = offered()
-    if name not in others and ":" not in name:
-        names = ", ".join([HUMANOID, *sorted(others), f"{ARM}FILE.npz", "module:callable"])
-        raise InputError("robot", f"unknown robot '{name}'", f"choose one of {names}")
-    point = others.get(name) or EntryPoint(name, name, ENTRY_POINTS)
+    if ":" not in name:
+        remedy = f"choose one of {HUMANOID}, {ARM}FILE.npz, module:callable"
+        raise InputError("robot", f"unknown robot '{name}'", remedy)
     try:
-        return point.load()
+        return EntryPoint(name, name, "").load()
     except (ImportError, AttributeError, ValueError) as error:
         remedy = "give a module:callable that Python can import"
-        raise InputError("robot", f"'{point.value}' cannot be imported ({error})", remedy) from None
+        raise InputError("robot", f"'{name}' cannot be imported ({error})", remedy) from None
 
 
 def located(name: str) -> str:
