@@ -12,7 +12,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from caryatid.errors import InputError, check_type
+from caryatid.errors import InputError, WrongViewError, check_type
 from caryatid.geometry import points as kernels
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
@@ -95,7 +95,7 @@ class View(Pictured):
             raise InputError(name, f"depth contains {bad} values", "mark missing readings with 0 or NaN")
         if depth.max() > AWAY and (far := float(np.median(depth[depth > 0.0]))) > AWAY:
             unit = describe_unit(depth[depth > 0.0])
-            raise InputError(
+            raise WrongViewError(
                 name, f"depth is about {far:.4g} m{unit}", f"give depth in metres{undo_unit(unit)}"
             )
         # Anything nearer than a micrometre is not a reading, and its inverse may be infinite.
