@@ -521,9 +521,9 @@ class TestCommands:
 
     @pytest.mark.parametrize(
         ("name", "segmentation", "why", "views"),
-        [("clear", "labels", "is not the id of an object; known objects: o1 (crate), o2 (can)", None),
-         ("clear", "auto", "was not found in 2 views; objects found: o1, o2", 2),
-         ("explore", "auto", "was not found in 2 views; objects found: o1, o2", 2)],
+        [("clear", "labels", "is not an object; known objects: o1 (crate), o2 (can)", None),
+         ("clear", "auto", "was not found in 2 views; known objects: o1, o2", 2),
+         ("explore", "auto", "was not found in 2 views; known objects: o1, o2", 2)],
     )  # fmt: skip
     def test_an_unknown_goal_is_an_error(self, name, segmentation, why, views, scene_file, tmp_path, capsys):
         command = [name, scene_file, "--goal", "o99", "--views", 2, "--segmentation", segmentation]
@@ -533,6 +533,17 @@ class TestCommands:
         assert (tmp_path / "run").exists() == (views is not None)
         if views is not None:
             assert len(read_run(tmp_path / "run").views) == views
+
+    def test_a_body_of_a_scene_can_be_the_goal(self, scene_file, tmp_path, capsys):
+        steps = []
+        for goal in ("can", "o2"):
+            command = ["clear", scene_file, "--goal", goal, "--json", "--no-report", "--out", tmp_path / goal]
+            assert run_command(*command, *SMALL, *QUICK) == 0
+            steps.append(json.loads(capsys.readouterr().out)["steps"])
+        assert steps[0] == steps[1]
+        assert steps[0][-1]["body"] == "can"
+        assert run_command("explore", scene_file, "--goal", "cam", "--out", tmp_path / "run", *SMALL) == 4
+        assert "did you mean can? known objects: o1 (crate), o2 (can)" in capsys.readouterr().err
 
     @pytest.mark.parametrize(("segmentation", "first"), [("labels", "o4"), ("auto", None)])
     def test_a_goal_that_no_view_shows_is_uncovered_where_labels_can_name_it(self, segmentation, first):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from os import PathLike
 from pathlib import Path
 
@@ -33,6 +34,12 @@ class InputError(CaryatidError):
         return type(self), (self.source, self.reason, self.remedy)
 
 
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Ask whether the most similar known word was meant, with a space after the question; "" if none is."""
+    meant = get_close_matches(word, [*known], 1)
+    return f"did you mean {meant[0]}? " if meant else ""
+
+
 def check_type(name: str, value: object, wanted: str | type | tuple[type, ...], remedy: str) -> None:
     """Reject an argument of the wrong type, or without a method of this name.
 
@@ -49,7 +56,7 @@ class GoalError(InputError):
 
 
 class WrongViewError(InputError):
-    """A view whose camera or pose cannot be correct; other views may be usable."""
+    """A view whose depth, camera or pose cannot be correct; other views may be usable."""
 
 
 class PerceptionError(CaryatidError):

@@ -409,7 +409,7 @@ class Explorer:
 
     def _goal_id(self) -> str | None:
         """The goal's id, if it is known by its name and was found."""
-        return None if self.goal is None else self._newest().graph.find_id(self.goal)
+        return None if self.goal is None else self._newest().graph.find_id(self.goal) or self.goal
 
     def _moving(self) -> Robot:
         if self.robot is None:
@@ -481,7 +481,7 @@ def explore(
                 yield late
                 step = replace(late, stop=step.stop)
             step = explorer.conclude(step)
-            lost = goal is not None and step.graph.find_id(goal) not in step.graph
+            lost = goal is not None and step.graph.find_id(goal) is None
             yield replace(step, stop=f"{step.stop}; {goal} was not found") if lost else step
             return
 

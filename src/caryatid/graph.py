@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from caryatid.errors import GoalError
+from caryatid.errors import GoalError, did_you_mean
 from caryatid.geometry.shapes import Shape, Uncertainty
 from caryatid.geometry.transforms import Array
 from caryatid.runtime import Pictured
@@ -148,7 +148,7 @@ class SupportGraph(Pictured):
         for candidate in self.objects:
             if candidate.id == object_id:
                 return candidate
-        raise KeyError(f"unknown object '{word}'; known objects: {', '.join(o.title for o in self.objects)}")
+        raise KeyError(f"unknown object '{word}'; {self.suggest(word)}")
 
     def __contains__(self, object_id: object) -> bool:
         return any(o.id == object_id for o in self.objects)
@@ -159,18 +159,23 @@ class SupportGraph(Pictured):
     def __iter__(self) -> Iterator[str]:
         return (o.id for o in self.objects)
 
-    def find_id(self, word: str) -> str:
-        """Return the id of the object with an id or a name; the word itself if there is none.
+    def find_id(self, word: str) -> str | None:
+        """Return the id of the object with an id or a name; None if there is none.
 
         Raises:
             GoalError: Several objects have the name.
         """
         ids = [o.id for o in self.objects if o.name == word]
-        if word in self or not ids:
+        if word in self:
             return word
         if len(ids) > 1:
             raise GoalError(word, "is the name of several objects", f"give the id: {', '.join(ids)}")
-        return ids[0]
+        return ids[0] if ids else None
+
+    def suggest(self, word: str) -> str:
+        """Say what a word that is no object's id or name may mean, and list the objects, as a remedy."""
+        meant = did_you_mean(word, [o.name for o in self.movable if o.name is not None])
+        return f"{meant}known objects: {', '.join(o.title for o in self.movable) or 'none'}"
 
     @property
     def support_surface(self) -> SceneObject | None:

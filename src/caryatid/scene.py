@@ -184,8 +184,8 @@ class Scene(Pictured):
             supporter: Id or name of an object, such as `o1`.
             supported: Id or name of an object.
         """
-        graph = self.graph
-        return explain(graph, graph.find_id(supporter), graph.find_id(supported), self.config.support)
+        a, b = (self.graph.find_id(word) or word for word in (supporter, supported))
+        return explain(self.graph, a, b, self.config.support)
 
     def why(self, object_id: str, other: str | None = None) -> Reasons:
         """Say what an object's explanation costs, and what others would; or why two objects are two.
@@ -198,9 +198,9 @@ class Scene(Pictured):
             InputError: An object is unknown, or has no points, or both are the same.
         """
         words, labels = [object_id] if other is None else [object_id, other], list[int]()
-        ids = [self.graph.find_id(word) for word in words]
+        ids = [self._object(word).id for word in words]
         for id_ in ids:
-            label = self._label_of(self._object(id_).id)
+            label = self._label_of(id_)
             if label is None or label not in self._models.fits:
                 raise InputError(id_, "has no points in the newest model", "ask about another object")
             labels.append(label)
@@ -222,7 +222,7 @@ class Scene(Pictured):
         Raises:
             InputError: The object is unknown, or it is the support surface.
         """
-        return predict_removal(self.graph, self.graph.find_id(object_id), self.config.support)
+        return predict_removal(self.graph, self._object(object_id).id, self.config.support)
 
     def order(
         self,
@@ -393,8 +393,7 @@ class Scene(Pictured):
         for o in self.graph.objects:
             if o.id == self.graph.find_id(object_id) and o.role == "object":
                 return o
-        known = ", ".join(o.title for o in self.graph.movable)
-        raise InputError(object_id, "is not an object of the graph", f"known objects: {known or 'none'}")
+        raise InputError(object_id, "is not an object of the graph", self.graph.suggest(object_id))
 
     def _labels(self) -> set[int]:
         """Labels of the objects, in the models and in the graph."""

@@ -271,8 +271,8 @@ def write_report(
 def _plan_order(run: Run, config: Config, asked: LiftingCommand | None) -> orders.Order:
     """Plan what to remove after a run, as asked for, or as its command was; ignore a goal that is unknown."""
     options, graph, seed = run.record["options"], run.graph, run.record["seed"]
-    wanted, hands, reachable = graph.find_id(options.get("goal") or ""), options.get("hands", 1), None
-    goal = wanted if wanted in graph else None
+    goal, hands, reachable = run.record.get("goal") or options.get("goal"), options.get("hands", 1), None
+    goal = None if goal is None else graph.find_id(goal)
     if asked is not None:
         goal, hands, reachable = asked.goal or goal, max(asked.hands, hands), asked.reachable(config)
     return orders.plan_order(

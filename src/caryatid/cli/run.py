@@ -22,7 +22,7 @@ from caryatid.cli.commands import Clear, Demo, Explore, Extract, View
 from caryatid.cli.output import kept, table
 from caryatid.cli.results import write_report
 from caryatid.config import Config
-from caryatid.errors import GoalError, InputError
+from caryatid.errors import GoalError, InputError, did_you_mean
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import TrueScene, score
 from caryatid.evaluation.truths import evaluate_run
@@ -52,16 +52,17 @@ def explore_scene(command: Explore) -> None:
     config, looking = command.config(), command.looking
     with RunWriter(command.out, config, _about(command)) as writer:
         source, masks = _open(command, config)
-        _check_goal(command, source, config)
+        goal = _find_goal(command, source, config)
+        writer.more |= {"goal": goal} if goal else {}
         name, truth = source.name, source.truth
         planner, camera = planner_for(command.chosen_planner, source.camera, truth, config, **looking)
         steps = explore(
-            camera, source.robot, planner=planner, config=config, masks=masks, goal=command.goal,
+            camera, source.robot, planner=planner, config=config, masks=masks, goal=goal,
             until=command.until, budget=command.budget, early_stop=not command.no_early_stop, **looking,
         )  # fmt: skip
         with Stream(command.stream) if command.stream else nullcontext() as stream:
             last = _record(command, writer, name, steps, truth, stream)
-    _finish(command, writer, name, last, command.goal)
+    _finish(command, writer, name, last, goal)
 
 
 def extract_views(command: Extract) -> None:
@@ -127,21 +128,21 @@ def clear_table(command: Clear) -> int:
     camera = source.camera
     if not isinstance(camera, SimulatedCamera):
         raise InputError(command.source, "cannot be simulated", "give a built-in scene or an MJCF scene")
-    _check_goal(command, source, config)
+    goal = _find_goal(command, source, config)
     explorer = Explorer(
         camera, source.robot, planner=command.chosen_planner, config=config, masks=masks, **command.looking
     )
     with RunWriter(command.out, config, _about(command)) as writer:
         lifts = RecordedLifts(writer, explorer, camera, config)
         steps = clear(
-            explorer, lifts.take, goal=command.goal, hands=command.hands, threads=cores(), reachable=reachable
+            explorer, lifts.take, goal=goal, hands=command.hands, threads=cores(), reachable=reachable
         )
         last = _record(command, writer, source.name, steps)
     _draw_report(command)
     if not lifts.done:
-        _check_found(command.goal, last)
+        _check_found(goal, last)
     left, harmed = lifts.hands.left, sorted({body for lift in lifts.done for body in lift["disturbed"]})
-    success = not harmed and (last.stop == f"{command.goal} is removed" if command.goal else not left)
+    success = not harmed and (last.stop == f"{goal} is removed" if goal else not left)
     taken = [{name: value for name, value in lift.items() if name != "state"} for lift in lifts.done]
     document = {"run": str(command.out), "success": success, "stop": last.stop, "views": last.index + 1}
     document |= {"steps": taken, "left": left, "warnings": output.warnings}
@@ -207,24 +208,26 @@ def _open_source(command: Explore | View | Clear, masks: MaskSource | None, conf
     )  # fmt: skip
 
 
-def _check_goal(command: Explore | Clear, source: Source, config: Config) -> None:
-    """Reject a goal that is not among the simulator's labels, if objects are named by them."""
+def _find_goal(command: Explore | Clear, source: Source, config: Config) -> str | None:
+    """Find the id of a goal that is one or a body's name, if objects are named by the simulator's labels."""
     goal, camera = command.goal, source.camera
     others = command.segmentation == "auto" or command.settings.masks_from is not None
     if goal is None or others or config.fusion.masks != "scene" or not isinstance(camera, SimulatedCamera):
-        return
+        return goal
     bodies = {object_id(label): body for label, body in camera.scene.object_bodies.items()}
-    if goal not in bodies:
-        known = ", ".join(f"{i} ({body})" for i, body in bodies.items())
-        raise GoalError(f"--goal {goal}", "is not the id of an object", f"known objects: {known}")
+    for i, body in bodies.items():
+        if goal in (i, body):
+            return i
+    known = ", ".join(f"{i} ({body})" for i, body in bodies.items())
+    remedy = f"{did_you_mean(goal, bodies.values())}known objects: {known}"
+    raise GoalError(f"--goal {goal}", "is not an object", remedy)
 
 
 def _check_found(goal: str | None, last: Step) -> None:
     """Reject a goal that the last graph lacks."""
-    found = [o.title for o in last.graph.movable]
-    if goal is not None and last.graph.find_id(goal) not in last.graph:
+    if goal is not None and last.graph.find_id(goal) is None:
         reason = f"was not found in {count_of(last.index + 1, 'view')}"
-        raise GoalError(f"--goal {goal}", reason, f"objects found: {', '.join(found) or 'none'}")
+        raise GoalError(f"--goal {goal}", reason, last.graph.suggest(goal))
 
 
 def _conditions(command: Explore | Extract | Clear) -> str:

@@ -7,7 +7,6 @@ import textwrap
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from caryatid.config.choices import Preset
 from caryatid.config.stages import Config
-from caryatid.errors import InputError
+from caryatid.errors import InputError, did_you_mean
 
 _ADAPTER = TypeAdapter(Config)
 
@@ -131,9 +130,7 @@ def _refusal(error: ValidationError, settings: Mapping[str, Any], source: str) -
     if fault["type"] == "unexpected_keyword_argument":
         known = fields(Config) if not names else fields(getattr(Config(), stage))
         listed = [field.name for field in known]
-        meant = get_close_matches(name.rpartition(".")[2], listed, 1)
-        remedy = f"did you mean {meant[0]}? " if meant else ""
-        remedy += f"choose from {', '.join(listed)}"
+        remedy = f"{did_you_mean(name.rpartition('.')[2], listed)}choose from {', '.join(listed)}"
         return InputError(source, f"unknown setting '{name}'", remedy)
     if not names:
         return InputError(source, f"'{stage}' is a table, not a setting", f"write [{stage}]")

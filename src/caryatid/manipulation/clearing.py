@@ -67,7 +67,7 @@ def clear(
         explorer.look()
         explorer.finish()
         views += 1
-        found = None if goal is None else explorer.scene.graph.find_id(goal)
+        found = None if goal is None else explorer.scene.graph.find_id(goal) or goal
         lift, reason = _lift(explorer, found, hands, threads, views, reachable)
         if lift is not None:
             views, missed = 0, 0 if take(lift) else missed + 1

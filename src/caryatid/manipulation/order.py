@@ -132,15 +132,11 @@ def plan_order(
         raise InputError("hands", f"{hands} is neither 1 nor 2", "give the number of hands")
     if threads < 1:
         raise InputError("threads", f"{threads} is less than 1", "give the number of parallel rehearsals")
-    goal = None if goal is None else graph.find_id(goal)
+    named, goal = goal, None if goal is None else graph.find_id(goal)
     config = config or Config()
     rehearsal = _Rehearsal(graph, config, seed, threads, voxels, reachable)
-    if goal is not None and goal not in rehearsal.ids:
-        raise GoalError(
-            goal,
-            "is not an object of the graph",
-            f"known objects: {', '.join(graph[i].title for i in rehearsal.ids)}",
-        )
+    if named is not None and goal not in rehearsal.ids:
+        raise GoalError(named, "is not an object of the graph", graph.suggest(named))
     found: list[TakeStep] = []
     refusal = ""
     while len(found) != steps and (left := rehearsal.left()) and (goal is None or goal in left):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Mapping
-from difflib import get_close_matches
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Final, cast
@@ -14,7 +13,7 @@ import mujoco
 import numpy as np
 
 from caryatid.config import PhysicsConfig
-from caryatid.errors import InputError
+from caryatid.errors import InputError, did_you_mean
 from caryatid.simulation import world
 from caryatid.simulation.generation import SIZES, GeneratedKind, generate
 from caryatid.simulation.layout import lay_out, unknown_keyframe
@@ -137,8 +136,7 @@ def load_scene(
         return generate(cast(GeneratedKind, match[1]), int(match[2]), int(match[3]), config)
     path, listed = Path(text), "`caryatid scenes` lists the built-in ones"
     if not path.exists():
-        meant = get_close_matches(text, DESIGNED, 1)
-        remedy = f"did you mean {meant[0]}? {listed}" if meant else listed
+        remedy = did_you_mean(text, DESIGNED) + listed
         raise InputError(text, "no such file, folder or built-in scene", remedy)
     if path.is_dir():
         path = path / SCENE_FILE
