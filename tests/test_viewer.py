@@ -109,7 +109,8 @@ def test_a_shape_moves_as_a_whole_and_is_not_replaced(step, drawn):
     body, edges, shape = after["/shapes/o1"], after["/shapes/o1/edges"], objects[1].shape
     np.testing.assert_allclose(body.position, shape.T_world_object[:3, 3])
     np.testing.assert_allclose(edges.position, 0.0)
-    ends_world = transforms.transform(shape.T_world_object, edges.points.astype(float))
+    ends_world = transforms.transform(shape.T_world_object, edges.points.astype(float) * edges.scale)
+    np.testing.assert_allclose(body.scale, shape.extents)
     np.testing.assert_allclose(ends_world, shape.creases(), atol=1e-3)
     gone = drawn(replace(step, graph=replace(graph, objects=graph.objects[:2], supports=())))
     assert "/shapes/o1" in gone
@@ -137,12 +138,13 @@ def test_arrows_tell_direction_doubt_and_kind(step, drawn):
     assert (end - start) @ (above.centre_world - below.centre_world) > 0.0
     np.testing.assert_allclose(np.cross(end - start, above.centre_world - below.centre_world), 0.0, atol=1e-4)
     assert set(of(Support("o0", "o1"), Support("o0", "o2", certain=False))) >= {"arrow 1"}
-    doubtful = of(Support("o1", "o2", certain=False))
+    doubtful, widths = of(Support("o1", "o2", certain=False)), []
     assert len(doubtful["dashes 0"].points) > 1
-    assert doubtful["probability 0"].text == "0.50"
-    likely = of(Support("o1", "o2", probability=0.83))
-    assert likely["probability 0"].text == "0.83"
-    widths = [nodes["arrow 0"].shaft_radius for nodes in (doubtful, likely, certain)]
+    for certain, probability, said in ((False, None, "0.50"), (True, 0.83, "0.83"), (True, None, "")):
+        nodes = of(Support("o1", "o2", certain=certain, probability=probability))
+        assert (nodes["probability 0"].text if said else "") == said
+        assert ("probability 0" in nodes) == bool(said)
+        widths.append(nodes["arrow 0"].shaft_radius)
     assert widths == sorted(set(widths))
     assert of(Support("o1", "o2", "lean"))["probability 0"].text == "lean 1.00"
 

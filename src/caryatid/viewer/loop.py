@@ -23,7 +23,7 @@ from caryatid.planning.planners import BUILT_IN, offered
 from caryatid.runtime.parallel import cores
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.lifting import ASIDE
-from caryatid.viewer.drawing import without
+from caryatid.viewer.drawing import take_away
 from caryatid.viewer.page import Page
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ class LoopPage(Page):
             self.stage(None)
             self.add(step)
             taken = hands.take(lift, hands.bodies(step.graph))
-            film.extend(without(step, (), lift.object_id, T) for T in _moves(taken, hands.names, before))
+            film.extend(take_away(step, (), lift.object_id, T) for T in _moves(taken, hands.names, before))
             camera.scene = hands.scene
             done = "Found nothing at" if taken.body is None else "Removed"
             said = f"{done} {lift.object_id}; {_moved(taken.disturbed)}."
@@ -196,7 +196,7 @@ class LoopPage(Page):
             film.clear()
             # A lifted object stays away, though the graph holds it until the next view.
             gone = None if step.lift is None or step.stop is not None else step.lift.object_id
-            self.stage(None if gone is None else without(step, {gone}, gone, {}))
+            self.stage(None if gone is None else take_away(step, {gone}, gone, {}))
             self.add(step)
             self.say(said)
             self.ended = step.stop

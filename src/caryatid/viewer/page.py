@@ -25,7 +25,15 @@ from caryatid.runtime.parallel import cores
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import direction
 from caryatid.viewer.door import Door
-from caryatid.viewer.drawing import LAYERS, NEXT, SceneDrawing, reduced, step_of_scene, thinned, without
+from caryatid.viewer.drawing import (
+    LAYERS,
+    NEXT,
+    SceneDrawing,
+    reduce_step,
+    step_of_scene,
+    take_away,
+    thin_cloud,
+)
 from caryatid.viewer.panels import (
     IMAGES,
     describe_lifts,
@@ -106,8 +114,8 @@ class Page:
         """Add a step, or replace the step of the same view; a page at the newest step follows."""
         newest = self._shown == len(self.steps) - 1
         if step.index == len(self.steps) > 0:
-            self.steps[-1] = thinned(self.steps[-1])
-        self.steps[step.index : step.index + 1] = [reduced(step)]
+            self.steps[-1] = thin_cloud(self.steps[-1])
+        self.steps[step.index : step.index + 1] = [reduce_step(step)]
         self.scores[step.index : step.index + 1] = [f1]
         if newest:
             self._shown = len(self.steps) - 1
@@ -194,9 +202,9 @@ class Page:
         rising = [transforms.rigid(np.eye(3), (0.0, 0.0, height)) for height in np.linspace(0.0, 0.5, 8)[1:]]
         self._playing.set()
         for lift in self._planned[1].steps:
-            self._show(without(step, gone, lift.object_id, {lift.object_id: T}) for T in rising)
+            self._show(take_away(step, gone, lift.object_id, {lift.object_id: T}) for T in rising)
             gone.add(lift.object_id)
-            self._show([without(step, gone, lift.object_id, {})])
+            self._show([take_away(step, gone, lift.object_id, {})])
         self._playing.clear()
         self.stage(None)
         return ""
