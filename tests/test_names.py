@@ -18,7 +18,7 @@ from caryatid.io.images import png
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
 from caryatid.sessions import Session
-from caryatid.viewer.page import describe_object
+from caryatid.viewer.panels import describe_object
 from caryatid.viz.tables import describe
 
 NAMES = {1: "mug", 2: "tray"}

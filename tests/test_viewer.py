@@ -29,7 +29,8 @@ from caryatid.sources import open_source
 from caryatid.steps import read_run
 from caryatid.viewer.drawing import BY_HAND, EARLIER_POINTS, LAYERS
 from caryatid.viewer.loop import LoopPage
-from caryatid.viewer.page import Page, describe_object, describe_view
+from caryatid.viewer.page import Page
+from caryatid.viewer.panels import describe_object, describe_view
 from caryatid.viz.colours import object_colour, rgb
 
 pytest.importorskip("viser")
@@ -201,7 +202,8 @@ def test_the_loop_gives_the_views_that_explore_gives_and_says_when_it_would_stop
     page.wait()
     assert "cameras/next" not in page.drawing.nodes
     page._show_state("", busy=False)
-    assert (page._go.disabled, page._next.disabled) == (True, False)
+    page.wait()
+    assert page._buttons.options == ("next view", "plan", "clear", "restart")
     page.close()
     assert len(page.steps) == len(page.scores) == 3
     for step, shown, f1 in zip(steps, page.steps, page.scores, strict=False):
@@ -269,8 +271,11 @@ def test_earlier_views_keep_few_points_and_their_cameras_are_not_sent_again(step
 def test_a_recording_ends_with_its_views(recording, settings):
     page = LoopPage(partial(open_source, str(recording), noise="none", segmentation=None, seed=0), settings)
     assert "no candidate views left" in [page.turn() for _ in range(4)][-1]
+    page.wait()
     page.close()
     assert [step.robot for step in page.steps] == [None] * 3
+    assert page._chart is None, "there is no ground truth"
+    assert page._buttons.options == ("plan", "restart")
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -288,8 +293,8 @@ def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(loop, monkeypatch
         loop._running.set()
         assert loop.clear() == "Finished: no objects are left; no other object moved."
     else:
-        loop.plan()
-        loop.play()
+        loop.plan_order()
+        loop.play_order()
     rising = next(
         s for s in shown if s and s.graph["o2"].centre_world[2] > step.graph["o2"].centre_world[2] + 0.01
     )
@@ -328,7 +333,9 @@ def check_panels(page):
     planned = re.search(r"Order</b> after view (\d+)", lifts)
     assert page._play.disabled == ("1. o" not in lifts)
     assert planned is None or int(planned[1]) == number
-    assert set(re.findall(r"\d+\. (\w+)</dt>", lifts if planned else "")) <= vertices
+    order = re.findall(r"\d+\. (\w+)</dt>", lifts if planned else "")
+    assert set(order) <= vertices
+    assert re.findall(r"lift first</dt><dd>(o\d+):", summary) == order[:1]
     assert ("grasps it" in lifts) == bool(nodes["gripper"])
 
 
@@ -345,16 +352,16 @@ def test_no_panel_contradicts_another_in_fifty_walks_of_clicks(opening, settings
         page._gripper.value = str(rng.choice(["none", "franka", "suction"]))
 
     clicks = [
-        lambda: page.do("taking a view", page.turn),
+        lambda: page.queue_work("taking a view", page.turn),
         lambda: page.go_to(int(rng.integers(len(page.steps)))),
         lambda: page.describe(str(rng.choice(["o0", "o1", "o2", ""]))),
-        lambda: page.do("planning an order", page.plan),
+        lambda: page.queue_work("planning an order", page.plan_order),
         lambda: page.use_planner(str(rng.choice(["farthest", "support"]))),
         choose_goal,
         choose_gripper,
     ]
     for _ in range(50):
-        page.do("starting again", page.restart)
+        page.queue_work("starting again", page.restart)
         for click in rng.choice(clicks, 8):
             click()
             page.wait()
@@ -533,8 +540,13 @@ def test_the_first_sight_is_the_objects_with_their_names_and_what_moves_without_
     tab.wait_for_text("moves with probability")
     assert "o2" in tab.page.locator(".caryatid-cell").last.inner_text()
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
-    faults = axe.run(tab.page, context={"include": [[".caryatid-cell"]]}).response["violations"]
-    assert [(v["id"], v["nodes"][0]["html"]) for v in faults if v["impact"] in ("serious", "critical")] == []
+    for theme in ("light", "dark"):
+        tab.page.emulate_media(color_scheme=theme)
+        tab.page.reload()
+        tab.page.wait_for_selector(f'[data-mantine-color-scheme="{theme}"]')
+        tab.wait_for_text("Without o1")
+        faults = axe.run(tab.page, context={"include": [[".caryatid-cell"]]}).response["violations"]
+        assert [(v["id"], v["nodes"]) for v in faults if v["impact"] in ("serious", "critical")] == []
 
 
 @pytest.mark.slow
@@ -558,7 +570,7 @@ def test_a_person_goes_on_and_back_chooses_a_view_by_hand_and_clears(seen):
     tab.wait_for_node("/cameras/2")
 
     step = page.steps[-1]
-    tab.page.get_by_text("loop", exact=True).click()
+    tab.page.get_by_text("options", exact=True).click()
     tab.page.get_by_role("checkbox", name="choose by hand").click()
     client = next(iter(page.server.get_clients().values()))
     centre, radius = step.sphere.centre_world, step.sphere.radius
@@ -585,10 +597,10 @@ def test_a_person_goes_on_and_back_chooses_a_view_by_hand_and_clears(seen):
     tab.page.keyboard.press("Escape")
     tab.page.get_by_text("Why a cylinder").wait_for(state="hidden")
     tab.page.get_by_text("order", exact=True).click()
-    tab.press("plan order")
+    tab.press("plan")
     tab.wait_for_text("Safe order (nothing else moves")
     page.describe("o2")
-    tab.press("clear the simulated table")
+    tab.press("clear")
     tab.wait_for_text("Finished: no objects are left; no other object moved.")
     tab.wait_for_node("/shapes/o1", there=False)
     tab.wait_for_node("/shapes/o2", there=False)

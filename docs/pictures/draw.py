@@ -240,10 +240,10 @@ def viewer(browser: Any) -> Iterator[tuple[str, Image.Image]]:
         page.describe("")
         tab.page.get_by_text("order", exact=True).click()
         page._gripper.value = "robotiq-140"
-        tab.press("plan order")
+        tab.press("plan")
         tab.wait_for_text("after view 3")
         yield "order", shot(tab)
-        tab.press("clear the simulated table")
+        tab.press("clear")
         page.wait()
         tab.wait_for_text("finished")
         yield "cleared", shot(tab)

@@ -23,6 +23,12 @@ if TYPE_CHECKING:
 
 LARGEST = 50 * 1024 * 1024
 """Of a message, as viser allows [bytes]."""
+FOLLOW_THEME = b"""<head><script>if (matchMedia("(prefers-color-scheme: dark)").matches) {
+  const address = new URL(location)
+  address.searchParams.set("darkMode", "")
+  history.replaceState(null, "", address)
+}</script>"""
+"""What the page begins with: it follows the system to a dark theme, where viser sets one for everybody."""
 
 
 class Door:
@@ -129,12 +135,17 @@ def _app(inside: str, pages: Path, token: str, host: str, choose: Callable[[str]
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
+    page = (pages / "index.html").read_bytes().replace(b"<head>", FOLLOW_THEME, 1)
+
+    async def open_page(_: Request) -> Response:
+        return Response(page, media_type="text/html")
+
     async def click(request: Request) -> Response:
         choose(request.path_params["object_id"])
         return Response(status_code=204)
 
-    vertex = Route("/object/{object_id}", click)
-    routes = [vertex, WebSocketRoute("/", pass_on), Mount("/", StaticFiles(directory=pages, html=True))]
+    routes = [Route("/", open_page), Route("/object/{object_id}", click), WebSocketRoute("/", pass_on)]
+    routes.append(Mount("/", StaticFiles(directory=pages)))
     app = Starlette(routes=[WebSocketRoute(f"/{token}", pass_on), Mount(f"/{token}", routes=routes)])
 
     async def guarded(scope: Scope, receive: Receive, send: Send) -> None:

@@ -129,9 +129,10 @@ class SceneDrawing:
 
     def __init__(self, server: Any, clicked: Callable[[str], None]) -> None:
         self._server, self._scene, self._clicked = server, server.scene, clicked
-        self._frames = {name: self._scene.add_frame(f"/{name}", show_axes=False) for name in LAYERS}
-        for name, (shown, _) in LAYERS.items():
-            self._frames[name].visible = shown
+        self._frames = {
+            name: self._scene.add_frame(f"/{name}", show_axes=False, visible=shown)
+            for name, (shown, _) in LAYERS.items()
+        }
         self._shown: dict[str, tuple[Any, ...]] = {}
         self._looks: dict[str, dict[str, Any]] = {}
         self.nodes: dict[str, list[Any]] = {name: [] for name in LAYERS}
@@ -195,9 +196,9 @@ class SceneDrawing:
         one by one, and meanwhile show some where they are and others where they were.
         """
         known = {node.name: node for node in self.nodes.get(layer, [])}
-        for name in reversed([*known]):  # Edges before their shape.
-            if name not in wanted:
-                known.pop(name).remove()
+        for name in [each for each in reversed(known) if each not in wanted]:  # Edges before their shape.
+            known.pop(name).remove()
+            del self._looks[name]
         for name, (add, look) in wanted.items():
             if name not in known:
                 known[name] = getattr(self._scene, f"add_{add}")(name, **look)
@@ -264,11 +265,11 @@ def _draw_shapes(graph: SupportGraph, chosen: str) -> Nodes:
         simple = kind in UNIT_SOLIDS
         vertices, faces, ends = _solid_of(kind if simple else shape)
         size = {"scale": tuple(shape.extents.tolist()) if simple else (1.0, 1.0, 1.0)}
-        strong = OPACITY if item.role == "object" else 1.0
+        faint, strong = chosen not in (item.id, ""), OPACITY if item.role == "object" else 1.0
         look = {"vertices": vertices, "faces": faces, "color": colour, "side": "double"} | size
-        look |= {"opacity": strong if chosen in (item.id, "") else FAINT, "flat_shading": shape.kind == "box"}
+        look |= {"opacity": FAINT if faint else strong, "flat_shading": shape.kind == "box"}
         yield "mesh_simple", name, look | _pose(shape.T_world_object) | MATT
-        dark = 0.55 * np.array(colour)
+        dark = 0.55 * np.array(colour) + 100.0 * faint
         yield from _draw_lines(f"{name}/edges", ends, dark, **size, **SCREEN)
 
 
@@ -294,7 +295,8 @@ def _draw_gripper(grasp: Grasp | None, gripper: GripperConfig | None) -> Nodes:
 def _draw_grid(height: float, top: float) -> Nodes:
     """A grid below everything, and the world's x and y axes at the height of the surface."""
     look: dict[str, Any] = {"width": 4.0, "height": 4.0, "cell_size": 0.1, "section_size": 0.5}
-    look |= {"cell_color": (234, 236, 238), "section_color": (214, 217, 221), "shadow_opacity": 0.0}
+    look |= {"cell_color": EARLIER, "section_color": EARLIER, "cell_thickness": 0.3}
+    look |= {"section_thickness": 0.6, "shadow_opacity": 0.0}
     yield "grid", "/grid/lines", look | {"position": (0.0, 0.0, height - 0.001)}
     axes = np.array([(0.0, 0.0, top)] * 2 + [(0.1, 0.0, top), (0.0, 0.1, top)]).reshape(2, 2, 3)
     colours = np.array([[(200, 40, 40)] * 2, [(40, 140, 40)] * 2], dtype=np.uint8)

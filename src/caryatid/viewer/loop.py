@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -102,7 +103,7 @@ class LoopPage(Page):
         explorer, truth, f1 = self._explorer, self.source.truth, None
         with self.working:
             if explorer.step is not None and (step := explorer.go()).stop is not None:
-                self._put(step)
+                self.add(step, self.scores[step.index])
                 self.ended = step.stop
                 return self.ended
             explorer.look()
@@ -129,7 +130,7 @@ class LoopPage(Page):
         if step.decision is None:
             raise PlanningError(step.stop or "the planner found no next view")
         self._decided = step.decision
-        self._put(step)
+        self.add(step, self.scores[step.index])
         return f"next view chosen by {name}"
 
     def use_fusion(self, method: FusionMethod) -> str:
@@ -152,15 +153,11 @@ class LoopPage(Page):
         """
         with self.working:
             step = self._explorer.choose(chosen)
-        self._put(step)
+        self.add(step, self.scores[step.index])
         if self._decided is None or step.decision is None:
             return "next view chosen by hand"
         yours, planned = step.decision.score, self._decided.score
         return f"next view chosen by hand: score {yours:.2f}; {self.planner} chose one with {planned:.2f}"
-
-    def _put(self, step: Step) -> None:
-        """Show the newest step with another next view."""
-        self.add(step, self.scores[step.index])
 
     def clear(self) -> str:
         """Clear a simulated table, as `clear` does; return a message, empty for a recording."""
@@ -212,17 +209,15 @@ class LoopPage(Page):
     def start(self) -> None:
         """Take the first or the next view in the worker thread."""
         self._running.clear()
-        self.do("taking a view", lambda: _finished(self.turn()))
+        self.queue_work("taking a view", lambda: _finished(self.turn()))
 
     def _add_controls(self) -> None:
         gui = self.server.gui
+        hint = "Next view: go there and look. Run: look until no view is worth it. Clear: lift what is safe, "
+        hint += "look again, until nothing is left. Restart: put everything back. "
+        self._buttons.hint = hint + self._buttons.hint
         names = [*dict.fromkeys([*BUILT_IN, *sorted(offered()), self.planner])]
-        hint = "Move to the next view and take it"
-        self._next = gui.add_button("next view", hint=hint, order=-10)
-        hint = "Take views until the exploration would stop; or pause"
-        self._go = gui.add_button("run", hint=hint, order=-9)
-        self._clear.visible = isinstance(self.source.camera, SimulatedCamera)
-        with gui.add_folder("loop", order=10, expand_by_default=False):
+        with gui.add_folder("options", order=2, expand_by_default=False):
             hint = "What chooses the next view"
             planner = gui.add_dropdown("planner", names, initial_value=self.planner, hint=hint)
             hint = "How views are joined: pc = their points, sg = their graphs; repeats the same views"
@@ -230,33 +225,31 @@ class LoopPage(Page):
             fusion = gui.add_dropdown("fusion", get_args(FusionMethod), initial_value=method, hint=hint)
             hint = "Click the view sphere to choose the next view"
             self._by_hand = gui.add_checkbox("choose by hand", False, hint=hint)
-            restart = gui.add_button("restart", hint="Put everything back, and forget all views")
-        self._choices = planner, fusion, restart
-        self._next.on_click(lambda _: self.start())
-        self._go.on_click(lambda _: self._run_or_pause("running", self._run))
-        self._clear.on_click(lambda _: self._run_or_pause("clearing", self.clear))
-        restart.on_click(lambda _: self.do("starting again", self.restart))
-        planner.on_update(lambda _: self.do("replanning", lambda: self.use_planner(planner.value)))
-        fusion.on_update(lambda _: self.do("repeating the same views", lambda: self.use_fusion(fusion.value)))
+        self._choices, queue = (planner, fusion), self.queue_work
+        planner.on_update(lambda _: queue("replanning", lambda: self.use_planner(planner.value)))
+        fusion.on_update(lambda _: queue("repeating the same views", lambda: self.use_fusion(fusion.value)))
         self._by_hand.on_update(lambda _: self._show_sphere(self._by_hand.value))
 
-    def _run_or_pause(self, what: str, work: Callable[[], str | None]) -> None:
-        """Queue work, or have it stop after the current view."""
+    def _list_buttons(self) -> dict[str, Callable[[], None]]:
         if self._running.is_set():
-            self._running.clear()
-        else:
-            self._running.set()
-            self.do(what, work)
+            return {"pause": self._running.clear}
+        if self._busy:
+            return {}
+        buttons = {"next view": self.start} if self.ended is None else {}
+        if not self.steps or self.steps[-1].stop is None:
+            buttons["run"] = partial(self._keep_on, "running", self._run)
+        buttons |= super()._list_buttons()
+        if self.ended is None and isinstance(self.source.camera, SimulatedCamera):
+            buttons["clear"] = partial(self._keep_on, "clearing", self.clear)
+        buttons["restart"] = partial(self.queue_work, "starting again", self.restart)
+        return buttons
+
+    def _keep_on(self, what: str, work: Callable[[], str | None]) -> None:
+        """Queue work that goes on until it is paused."""
+        self._running.set()
+        self.queue_work(what, work)
 
     def _show_state(self, text: str, *, busy: bool) -> None:
-        running, finished = (
-            busy and self._running.is_set(),
-            bool(self.steps) and self.steps[-1].stop is not None,
-        )
-        self._next.disabled = busy or self.ended is not None
-        self._go.label = "pause" if running else "run"
-        self._go.disabled = not running and (busy or finished)
-        self._clear.disabled = busy or not self.steps or self.ended is not None
         for choice in self._choices:
             choice.disabled = busy
         super()._show_state(text, busy=busy)
@@ -285,9 +278,9 @@ class LoopPage(Page):
             super()._point(event)
         elif step is not None and step.candidates is not None:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-            index = candidate_under(origin, direction, step.sphere, step.candidates, np.deg2rad(6.0))
+            index = find_candidate(origin, direction, step.sphere, step.candidates, np.deg2rad(6.0))
             if index is not None:
-                self.do("choosing", lambda: self.choose(index))
+                self.queue_work("choosing", lambda: self.choose(index))
 
 
 def _finished(reason: str | None) -> str | None:
@@ -298,17 +291,12 @@ def _moved(names: Sequence[str]) -> str:
     return f"{', '.join(names)} moved" if names else "no other object moved"
 
 
-def candidate_under(
+def find_candidate(
     origin_world: Array, direction_world: Array, sphere: ViewSphere, candidates: Candidates, within: float
 ) -> int | None:
-    """Which candidate a ray from the eye points at, where it first meets the sphere or else behind.
+    """Find the candidate that a ray from an eye (3,) [m] along a direction (3,) points at, or None.
 
-    Args:
-        origin_world: The eye (3,) [m].
-        direction_world: Where the ray goes (3,).
-        sphere: The view sphere.
-        candidates: The views on it that can be reached.
-        within: How far off the candidate may be, at the sphere's centre [rad].
+    It counts where it first meets the sphere or else behind, and may miss by an angle at its centre [rad].
     """
     ray = direction_world / np.linalg.norm(direction_world)
     offset = sphere.centre_world + sphere.radius * candidates.directions - origin_world

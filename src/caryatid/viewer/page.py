@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from html import escape
 from threading import Event, RLock
 from typing import Any, get_args
@@ -18,34 +19,16 @@ from caryatid.config import GRIPPERS, Config, GripperConfig, GripperKind, choose
 from caryatid.errors import CaryatidError, InputError, in_one_line
 from caryatid.exploration import Step
 from caryatid.geometry import transforms
-from caryatid.graph import SupportGraph, TakeStep
+from caryatid.graph import SupportGraph
 from caryatid.manipulation.order import Order, plan_order
 from caryatid.objects.reasons import Reasons
 from caryatid.runtime.parallel import cores
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import direction
+from caryatid.viewer import drawing, panels
 from caryatid.viewer.door import Door
-from caryatid.viewer.drawing import (
-    LAYERS,
-    NEXT,
-    SceneDrawing,
-    reduce_step,
-    step_of_scene,
-    take_away,
-    thin_cloud,
-)
-from caryatid.viewer.panels import (
-    IMAGES,
-    describe_lifts,
-    describe_object,
-    describe_signs,
-    describe_view,
-    draw_linked_graph,
-    draw_view,
-)
-from caryatid.viz.drawings import draw_chart
 from caryatid.viz.notebook import cell_html
-from caryatid.viz.report import Figure, Section
+from caryatid.viz.report import Section
 
 ALL = "all objects"
 """Goal of an order that removes everything."""
@@ -95,13 +78,14 @@ class Page:
         self.steps: list[Step] = []
         self.scores: list[float | None] = []
         self.why: Callable[[str], Reasons] | None = None
-        self.drawing = SceneDrawing(self.server, self.describe)
+        self.drawing = drawing.SceneDrawing(self.server, self.describe)
         self._config, self._seed, self._small = config or Config(), seed, small
         self._shown, self._chosen = -1, ""
         self._staged: Step | None = None
         self._planned: tuple[SupportGraph, Order, GripperConfig, str] | None = None
         self._drawer, self._worker = ThreadPoolExecutor(1, "viewer"), ThreadPoolExecutor(1, "loop")
         self._pending: Future[None] | None = None
+        self._chart: Any = None
         self._busy, self._running, self._playing = False, Event(), Event()
         self._build()
 
@@ -114,8 +98,8 @@ class Page:
         """Add a step, or replace the step of the same view; a page at the newest step follows."""
         newest = self._shown == len(self.steps) - 1
         if step.index == len(self.steps) > 0:
-            self.steps[-1] = thin_cloud(self.steps[-1])
-        self.steps[step.index : step.index + 1] = [reduce_step(step)]
+            self.steps[-1] = drawing.thin_cloud(self.steps[-1])
+        self.steps[step.index : step.index + 1] = [drawing.reduce_step(step)]
         self.scores[step.index : step.index + 1] = [f1]
         if newest:
             self._shown = len(self.steps) - 1
@@ -132,7 +116,7 @@ class Page:
         """Add the current state of a scene; the slider goes back to earlier states."""
         if scene.views:
             self.why = scene.why
-            self.add(step_of_scene(scene))
+            self.add(drawing.step_of_scene(scene))
 
     def show_layer(self, name: str, visible: bool) -> None:
         """Show or hide one of `LAYERS`."""
@@ -162,7 +146,7 @@ class Page:
             self._staged = step
             self.redraw()
 
-    def do(self, what: str, work: Callable[[], str | None]) -> None:
+    def queue_work(self, what: str, work: Callable[[], str | None]) -> None:
         """Queue work, and show the message that it returns."""
 
         def done() -> None:
@@ -179,7 +163,7 @@ class Page:
         with contextlib.suppress(RuntimeError):  # The page is being closed.
             self._worker.submit(done)
 
-    def plan(self) -> str:
+    def plan_order(self) -> str:
         """Plan an order from the graph of the view shown, with the gripper and goal chosen; return a message.
 
         Raises:
@@ -187,14 +171,14 @@ class Page:
         """
         graph, goal = self.steps[self._shown].graph, None if self._goal.value == ALL else self._goal.value
         gripper = choose_gripper(self._gripper.value, self._config.gripper)
-        config, named = replace(self._config, gripper=gripper), f"gripper {self._gripper.value}"
-        named += f", goal {self._goal.value}"
+        config = replace(self._config, gripper=gripper)
+        named = f"gripper {self._gripper.value}, goal {self._goal.value}"
         with self.working:
             order = plan_order(graph, config, goal=goal, seed=self._seed, threads=cores())
         self._planned = graph, order, gripper, named
         return ""
 
-    def play(self) -> str:
+    def play_order(self) -> str:
         """Show the lifts of the order one after the other, until another view is chosen; return a message."""
         step, gone = self.steps[self._shown], set[str]()
         if self._planned is None or self._planned[0] is not step.graph:
@@ -202,9 +186,9 @@ class Page:
         rising = [transforms.rigid(np.eye(3), (0.0, 0.0, height)) for height in np.linspace(0.0, 0.5, 8)[1:]]
         self._playing.set()
         for lift in self._planned[1].steps:
-            self._show(take_away(step, gone, lift.object_id, {lift.object_id: T}) for T in rising)
+            self._show(drawing.take_away(step, gone, lift.object_id, {lift.object_id: T}) for T in rising)
             gone.add(lift.object_id)
-            self._show([take_away(step, gone, lift.object_id, {})])
+            self._show([drawing.take_away(step, gone, lift.object_id, {})])
         self._playing.clear()
         self.stage(None)
         return ""
@@ -217,7 +201,6 @@ class Page:
 
     def _show_state(self, text: str, *, busy: bool) -> None:
         self._busy = busy
-        self._bar.visible = busy
         self.say(text)
         self.redraw()
 
@@ -250,30 +233,31 @@ class Page:
 
     def _build(self) -> None:
         gui = self.server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=NEXT)
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=drawing.NEXT)
         self.server.scene.set_up_direction("+z")
+        self._summary = gui.add_html("", order=-30)
         self._notice = gui.add_html("", order=-20, visible=False)
         self._bar = gui.add_progress_bar(100, animated=True, order=-19, visible=False)
+        hint = "Plan: find what to lift first, and then next, so that nothing else moves."
+        self._buttons = gui.add_button_group("do", ["plan"], order=-10, visible=False, hint=hint)
+        self._buttons.on_click(lambda event: self._list_buttons().get(event.target.value, self.redraw)())
         hint = "Go back to an earlier view"
         # Without an order, a later page of the same process would have it below the layers.
         self._slider = gui.add_slider("view", 1, 2, 1, 1, order=0, visible=False, hint=hint)
         self._slider.on_update(self._slide)
         self._about = gui.add_html("", order=1, visible=False)
-        self._summary = gui.add_html("", order=2)
-        panel = gui.add_panel()
+        self._panel = panel = gui.add_panel()
         with panel.add_tab("supports"):
             self._graph = gui.add_html("")
         with panel.add_tab("order"):
             self._build_order()
         with panel.add_tab("image"):
-            self._kind = gui.add_dropdown("show", [*IMAGES], hint="What to show of the view's image")
+            self._kind = gui.add_dropdown("show", [*panels.IMAGES], hint="What to show of the view's image")
             self._image = gui.add_html("")
-        with panel.add_tab("F1"):
-            self._chart = gui.add_html(cell_html(Section("", "No ground truth available.")))
         with panel.add_tab("scene"):
             self._build_layers()
         with panel.add_tab("key"):
-            gui.add_html(describe_signs())
+            gui.add_html(panels.explain_signs())
         for control in (self._kind, self._true_colours, self._size):
             control.on_update(lambda _: self.redraw())
         gui.add_command("Deselect the object", hotkey="escape").on_trigger(lambda _: self.describe(""))
@@ -296,14 +280,14 @@ class Page:
         self._gripper = gui.add_dropdown("gripper", grippers, initial_value=chosen, hint=hint)
         hint = "Reach one object, and remove only what is in its way"
         self._goal = gui.add_dropdown("goal", [ALL], hint=hint)
-        hint = "Find what to lift first, and then next, so that nothing else moves"
-        self._plan = gui.add_button("plan order", disabled=True, hint=hint)
         self._play = gui.add_button("play", disabled=True, hint="Show the lifts one after the other")
-        hint = "Look until a lift is safe, remove the object, look again, until the table is empty"
-        self._clear = gui.add_button("clear the simulated table", hint=hint, visible=False)
         self._lifts = gui.add_html("")
-        self._plan.on_click(lambda _: self.do("planning an order", self.plan))
-        self._play.on_click(lambda _: self.do("showing the lifts", self.play))
+        self._play.on_click(lambda _: self.queue_work("showing the lifts", self.play_order))
+
+    def _list_buttons(self) -> dict[str, Callable[[], None]]:
+        """List what can be done now, by the names of the buttons."""
+        plan = partial(self.queue_work, "planning an order", self.plan_order)
+        return {"plan": plan} if self.steps and not self._busy else {}
 
     def _build_layers(self) -> None:
         gui = self.server.gui
@@ -311,12 +295,11 @@ class Page:
         hint = "Move your eye to where it began, above the objects, or into the camera of the view shown"
         look = gui.add_button_group("look from", ("start", "above", "camera"), hint=hint)
         look.on_click(lambda event: self._look_from(event.target.value, event.client.camera))
-        for name, (shown, hint) in LAYERS.items():
+        for name, (shown, hint) in drawing.LAYERS.items():
             box = self._boxes[name] = gui.add_checkbox(name, shown, hint=hint)
             box.on_update(lambda event, name=name: self.show_layer(name, event.target.value))
-        self._true_colours = gui.add_checkbox(
-            "camera colours", False, hint="Colour points as cameras saw them"
-        )
+        hint = "Colour points as cameras saw them"
+        self._true_colours = gui.add_checkbox("camera colours", False, hint=hint)
         self._size = gui.add_slider("point size [mm]", 1.0, 12.0, 0.5, 3.0)
 
     def _look_at(self, step: Step) -> None:
@@ -344,7 +327,10 @@ class Page:
         target, up, fov = start.look_at, np.array([0.0, 0.0, 1.0]), start.fov
         position = target + (start.position - target) / min(eye.aspect, 1.0)
         view = self.steps[self._shown].view if self.steps else None
-        if where == "above":
+        if where == "start" and eye.aspect < 1.0:  # Above the panel, which such a window has at its bottom.
+            lower = 0.15 * np.linalg.norm(position - target) * up
+            target, position = target - lower, position - lower
+        elif where == "above":
             away = position - target
             position = target + np.linalg.norm(away) * transforms.unit(0.02 * away + (0.0, 0.0, 1.0))
         elif where == "camera" and view is not None and view.T_world_camera is not None:
@@ -369,46 +355,42 @@ class Page:
 
     def _draw(self) -> None:
         known, scores, chosen = self.steps, [*self.scores], self._chosen
-        steps = known[: self._shown + 1]
+        steps, buttons = known[: self._shown + 1], tuple(self._list_buttons())
+        self._bar.visible, self._buttons.visible = self._busy, bool(buttons)
+        self._buttons.options = buttons or self._buttons.options
         if not steps:
             return
         step, f1, count, number = steps[-1], scores[len(steps) - 1], len(known), len(steps)
         if self._staged is not None:
             step, f1 = self._staged, None
-        graph = step.graph
         before = steps[-2] if len(steps) > 1 else None
         lifts = [each.lift for each in steps if each.lift is not None]
         order, gripper, asked = None, None, ""
         if self._planned is not None and self._planned[0] is steps[-1].graph:
             _, order, gripper, asked = self._planned
-        lift = None if order is None or self._staged is not None else _lift_of(order, chosen)
-        drawn = draw_linked_graph(graph, chosen, f"/{self.url.rpartition('/')[2]}/object")
-        texts = [
-            (self._summary, describe_view(step, f1, count, before)), (self._graph, drawn),
-            (self._lifts, describe_lifts(steps[-1].graph, order, lifts, f"after view {number}; {asked}")),
-        ]  # fmt: skip
-        if self.server.get_clients():  # Nobody else sees it, and it costs most.
-            texts.append((self._image, draw_view(steps[-1], self._kind.value)))
+        told = None if self._staged is not None else order
+        possible = () if told is None else told.steps
+        lift = next((each for each in possible if each.object_id == chosen), next(iter(possible), None))
+        made = panels.describe_lifts(steps[-1].graph, order, lifts, f"after view {number}; {asked}")
+        texts = [(self._summary, panels.describe_view(step, f1, count, before, told)), (self._lifts, made)]
+        if self.server.get_clients():  # Nobody else sees the pictures, and they cost most.
+            address = f"/{self.url.rpartition('/')[2]}/object"
+            texts.append((self._graph, panels.draw_linked_graph(step.graph, chosen, address)))
+            texts.append((self._image, panels.draw_view(steps[-1], self._kind.value)))
         if any(f1 is not None for f1 in scores):
-            values = [np.nan if f1 is None else f1 for f1 in scores]
-            chart = Figure("", draw_chart("F1 after each view", "F1", {"F1": values}, top=1.0))
-            texts.append((self._chart, cell_html(Section("", figures=[chart]))))
+            if self._chart is None:
+                with self._panel.add_tab("F1"):
+                    self._chart = self.server.gui.add_html("")
+            texts.append((self._chart, panels.draw_scores(scores)))
         if chosen:
-            with self.working:
-                taken = chosen in {lift.object_id for lift in lifts} | {o.id for o in steps[-1].graph.objects}
-                why = self._reasons_of(chosen, step)
-                text = describe_object(graph, chosen, self._config.support, taken=taken, reasons=why)
-                texts.append((self._about, text))
+            taken = chosen in {lift.object_id for lift in lifts} | {o.id for o in steps[-1].graph.objects}
+            texts.append((self._about, self._explain(chosen, step, taken)))
         look = {"point_size": self._size.value / 1000.0, "true_colours": self._true_colours.value}
-        # Scene and texts change together.
-        with self.server.atomic():
-            places = () if order is None else [each.object_id for each in order.steps]
+        places = () if order is None else [each.object_id for each in order.steps]
+        with self.server.atomic():  # Scene and texts change together.
             self.drawing.show(step, steps, chosen=chosen, order=places, lift=lift, gripper=gripper, **look)
-            self._slider.visible = count > 1
-            self._slider.max = max(count, 2)
-            self._slider.value = number
+            self._slider.visible, self._slider.max, self._slider.value = count > 1, max(count, 2), number
             self._about.visible = bool(chosen)
-            self._plan.disabled = self._busy
             self._play.disabled = self._busy or order is None or not order.steps
             goals = (ALL, *(o.id for o in steps[-1].graph.movable))
             if self._goal.options != goals:
@@ -416,17 +398,15 @@ class Page:
             for panel, text in texts:
                 panel.content = text
 
-    def _reasons_of(self, object_id: str, step: Step) -> Reasons | None:
-        """Why an object has its shape after a step; None if that is unknown."""
-        if self.why is not None and self.steps and step is self.steps[-1]:
-            with contextlib.suppress(InputError):
-                return self.why(object_id)
-        return next((reasons for reasons in step.reasons if reasons.subject == (object_id,)), None)
-
-
-def _lift_of(order: Order, chosen: str) -> TakeStep | None:
-    """The lift of the chosen object, or else the first of an order."""
-    return next((step for step in order.steps if step.object_id == chosen), next(iter(order.steps), None))
+    def _explain(self, object_id: str, step: Step, taken: bool) -> str:
+        """Describe an object, and why it has its shape if that is known."""
+        reasons = next((each for each in step.reasons if each.subject == (object_id,)), None)
+        with self.working, contextlib.suppress(InputError):
+            if self.why is not None and self.steps and step is self.steps[-1]:
+                reasons = self.why(object_id)
+        with self.working:
+            graph, config = step.graph, self._config.support
+            return panels.describe_object(graph, object_id, config, taken=taken, reasons=reasons)
 
 
 def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:

@@ -14,7 +14,7 @@ from caryatid.objects.reasons import Reasons
 from caryatid.sensing.views import View
 from caryatid.support.relations import removal_of
 from caryatid.viz.colours import SALIENCY_STOPS, object_colour, scale
-from caryatid.viz.drawings import draw_image, image_of
+from caryatid.viz.drawings import draw_chart, draw_image, image_of
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.notebook import cell_html
 from caryatid.viz.pictures import Picture, element, raster
@@ -25,10 +25,18 @@ WIDTH = 380
 """Of pictures in a panel [px]."""
 
 
-def describe_view(step: Step, f1: float | None, count: int, before: Step | None = None) -> str:
-    """Describe the scene after a view, what happened since the step before, and what comes next."""
-    facts = [] if f1 is None else [("F1", f"{f1:.3f}")]
-    facts += happenings(before, step)
+def describe_view(
+    step: Step, f1: float | None, count: int, before: Step | None = None, order: Order | None = None
+) -> str:
+    """Describe the scene after a view, what happened since the step before, and what to do next."""
+    facts = happenings(before, step)
+    if order is not None and order.steps:
+        first = order.steps[0]
+        told = ["not safe"] * (not first.safe) + [f"hold {other}" for other in first.hold] + [first.why]
+        facts.append(("lift first", f"{first.object_id}: {'; '.join(told)}"))
+    elif order is not None:
+        facts.append(("lift first", f"nothing: {order.refusal}"))
+    facts += [] if f1 is None else [("F1", f"{f1:.3f}")]
     return cell_html(Section(f"View {step.index + 1} of {count}", census(step.graph), facts=facts))
 
 
@@ -53,7 +61,7 @@ def describe_object(
         removal = removal_of(graph, object_id, config)
         moves = [f"{e.object_id} moves with probability {e.probability:.2f}: {e.why}" for e in removal.moving]
         moves.append(f"nothing else moves with probability {removal.rest:.2f}")
-        facts = [(f"Without {object_id}", text) for text in moves] + facts
+        facts.insert(0, (f"Without {object_id}", "; ".join(moves)))
     table = object_table(graph)
     (row,) = (row for row in table.rows if row[0].text == item.title)
     facts += [(name, e.text) for name, e in zip(table.columns, row, strict=True) if e.text][2:]
@@ -89,11 +97,16 @@ def _list_lifts(order: Order, graph: SupportGraph) -> list[tuple[str, str]]:
 
 
 def draw_linked_graph(graph: SupportGraph, chosen: str, address: str) -> str:
-    """Draw the support graph, its vertices linked to an address; all but the chosen one are faint."""
+    """Draw the support graph, its vertices linked to an address.
+
+    All but the chosen one and its edges are faint; so are the edges of others while one is pointed at.
+    """
     picture, parts = draw_graph(graph, compact=True), []
+    names: list[str] = []
     for part in picture.parts:
-        kind, *names = part.get("class", "note").split()
-        if kind in ("node", "edge") and chosen and chosen not in names:
+        kind, *names = part.get("class", "").split() or ["note", *names]  # A note follows its edge.
+        part.set("class", " ".join([kind, *names]))
+        if chosen and chosen not in names:
             part.set("opacity", "0.3")
         if kind == "node":
             link = element("a", href=f"{address}/{names[0]}")
@@ -101,7 +114,9 @@ def draw_linked_graph(graph: SupportGraph, chosen: str, address: str) -> str:
             part = link
         parts.append(part)
     linked = Picture(picture.name, picture.width, picture.height, parts)
-    return cell_html(Section("", figures=[Figure("", linked)]))
+    pointed = [f"svg:has(.node.{o.id}:hover) :is(.edge, .note):not(.{o.id})" for o in graph.objects]
+    style = f"<style>{', '.join(pointed)} {{ opacity: 0.15 }}</style>" if pointed else ""
+    return style + cell_html(Section("", figures=[Figure("", linked)]))
 
 
 def _draw_pixels(view: View) -> Picture:
@@ -127,11 +142,18 @@ def draw_view(step: Step, kind: str) -> str:
     return cell_html(Section("", figures=[Figure("", IMAGES[kind](step.view, step))]))
 
 
-def describe_signs() -> str:
+def draw_scores(scores: Sequence[float | None]) -> str:
+    """Draw F1 after each view."""
+    values = [np.nan if f1 is None else f1 for f1 in scores]
+    chart = draw_chart("F1 after each view", "F1", {"F1": values}, top=1.0)
+    return cell_html(Section("", figures=[Figure("", chart)]))
+
+
+def explain_signs() -> str:
     """Explain the symbols in the scene."""
     signs = {
         "Arrow": "supporter → supported, at their contact; thicker = more probable, dashed = doubtful. "
-        "Supports by a support surface are drawn only if doubtful",
+        "Those from a support surface are drawn if doubtful, or if its object is chosen",
         "Number before a name": "its place in the order",
         "Number on an arrow": "probability of the support, if below 1",
         "Number in the graph": "views that found the object, of those that could have shown it",

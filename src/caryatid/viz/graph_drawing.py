@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, pairwise
+from statistics import fmean
 from xml.etree.ElementTree import Element
 
 import networkx as nx
@@ -101,7 +102,7 @@ def _abscissae(
             if not row or (row is rows[0] and len(row) == 1):
                 continue
             pull = 0.8 if wide and row is rows[0] else 1.0  # Surfaces move together with what they carry.
-            wish = {n: pull * float(np.mean([x[other] for other in joined[n] or [n]])) for n in row}
+            wish = {n: pull * fmean(x[other] for other in joined[n] or [n]) for n in row}
             ordered = sorted(row, key=lambda name: (wish[name], x[name]))
             width = np.array([wide.get(name, 1.0) if isinstance(name, str) else 0.4 for name in ordered])
             offset = np.cumsum(width) - width / 2.0
