@@ -213,9 +213,6 @@ class LoopPage(Page):
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        hint = "Next view: go there and look. Run: look until no view is worth it. Clear: lift what is safe, "
-        hint += "look again, until nothing is left. Restart: put everything back. "
-        self._buttons.hint = hint + self._buttons.hint
         names = [*dict.fromkeys([*BUILT_IN, *sorted(offered()), self.planner])]
         with gui.add_folder("options", order=2, expand_by_default=False):
             hint = "What chooses the next view"

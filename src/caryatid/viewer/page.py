@@ -238,8 +238,8 @@ class Page:
         self._summary = gui.add_html("", order=-30)
         self._notice = gui.add_html("", order=-20, visible=False)
         self._bar = gui.add_progress_bar(100, animated=True, order=-19, visible=False)
-        hint = "Plan: find what to lift first, and then next, so that nothing else moves."
-        self._buttons = gui.add_button_group("do", ["plan"], order=-10, visible=False, hint=hint)
+        # Without a hint, which would hide the answer above; the key explains them.
+        self._buttons = gui.add_button_group("do", ["plan"], order=-10, visible=False)
         self._buttons.on_click(lambda event: self._list_buttons().get(event.target.value, self.redraw)())
         hint = "Go back to an earlier view"
         # Without an order, a later page of the same process would have it below the layers.
@@ -287,7 +287,8 @@ class Page:
     def _list_buttons(self) -> dict[str, Callable[[], None]]:
         """List what can be done now, by the names of the buttons."""
         plan = partial(self.queue_work, "planning an order", self.plan_order)
-        return {"plan": plan} if self.steps and not self._busy else {}
+        objects = [o for step in self.steps[self._shown :][:1] for o in step.graph.objects]
+        return {} if self._busy or all(o.role != "object" for o in objects) else {"plan": plan}
 
     def _build_layers(self) -> None:
         gui = self.server.gui

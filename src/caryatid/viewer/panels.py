@@ -150,8 +150,12 @@ def draw_scores(scores: Sequence[float | None]) -> str:
 
 
 def explain_signs() -> str:
-    """Explain the symbols in the scene."""
+    """Explain the buttons and the symbols in the scene."""
     signs = {
+        "next view, run": "go there and look; look until no view is worth it",
+        "plan": "find what to lift first, and then next, so that nothing else moves",
+        "clear": "lift what is safe, look again, until nothing is left",
+        "restart": "put everything back, and forget all views",
         "Arrow": "supporter → supported, at their contact; thicker = more probable, dashed = doubtful. "
         "Those from a support surface are drawn if doubtful, or if its object is chosen",
         "Number before a name": "its place in the order",
