@@ -11,6 +11,8 @@ from conftest import refusal, run_command
 from test_service import body, serving
 
 from caryatid.exports import export_graph
+from caryatid.geometry.shapes import Box
+from caryatid.geometry.transforms import rigid
 from caryatid.graph import Support, SupportGraph
 from caryatid.io import graph_from_json, graph_to_json
 from caryatid.io.bop import read_recording, write_recording
@@ -119,6 +121,10 @@ def test_a_description_says_what_supports_what_and_what_is_free(views):
     assert lines[0].startswith("2 objects, 2 supports, 1 of them doubtful")
     (mug,) = (line for line in lines if line.startswith("- mug (o1)"))
     assert mug.endswith("supported by tray (o2) (0.60)")
+    lying = replace(
+        objects[1], shape=Box(rigid([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], np.ones(3)), [0.2, 0.06, 0.1])
+    )
+    assert "box 200 × 60 × 100, 200 high" in describe(SupportGraph((lying,)))
     assert "support nothing (`caryatid order` rehearses lifting them): mug (o1)" in lines
     assert lines[lines.index("doubtful:") + 1].startswith(
         "- tray (o2) → mug (o1), probability 0.60: it rests"

@@ -249,13 +249,15 @@ def _settled_by(graph: SupportGraph, *ids: str) -> str:
 def describe(graph: SupportGraph) -> str:
     """Describe a scene model in plain text: objects, what supports them, what is free, what is doubtful."""
     titles = {o.id: o.title for o in graph.objects}
-    lines = [f"{census(graph)}; sizes in mm, probabilities in brackets"]
+    sizes = "sizes in mm along an object's own axes (x × y × z, or ⌀ × length), and its height"
+    lines = [f"{census(graph)}; {sizes}; probabilities in brackets"]
     for item in graph.objects:
         held = [f"{titles[s.supporter]} ({s.belief:.2f})" for s in graph.supporters(item.id)]
         role = f"supported by {' and '.join(held) or 'something unseen'}"
         if item.role == "support_surface":
             role = "support surface"
-        lines.append(f"- {item.title}: {item.shape.kind} {size_of(item.shape)}, {role}")
+        high = 1e3 * float(item.shape.support(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])).sum())
+        lines.append(f"- {item.title}: {item.shape.kind} {size_of(item.shape)}, {high:.0f} high, {role}")
     holding = {s.supporter for s in graph.supports}
     free = [o.title for o in graph.movable if o.id not in holding]
     lines.append(f"support nothing (`caryatid order` rehearses lifting them): {', '.join(free) or 'none'}")
