@@ -49,8 +49,6 @@ LEFT = 0.5
 """Maximum share of the planes' tilt that what explains it leaves [1]."""
 SURE = 16.3
 """Sum of squares [σ²] that an explanation must save: its three numbers save it once in 1000 by chance."""
-STEPS = 20
-"""Number of steps in which a rotation of vectors is found [1]."""
 FOCAL_FACTORS = np.geomspace(0.5, 2.0, 57)
 """Factors of the focal lengths that are tried [1], 2.5 % apart: half and double mean another image size."""
 LEAST = 20
@@ -80,8 +78,6 @@ BODY_AXES = (
     "z forward): give the pose of the optical frame, or for a recording --set recording.axes=body"
 )
 """A cause of a wrong camera pose, and its remedy."""
-
-
 INVERSE = "T_world_camera is the inverse, world to camera: invert it"
 """A cause of a wrong camera pose, and its remedy."""
 
@@ -177,8 +173,6 @@ INCONSISTENT = (
     "poses and K"
 )
 """What is said of tilted planes that no rotation of the world makes level."""
-
-
 TRANSPOSED = "only the rotation of T_world_camera is inverse: transpose it"
 """A cause of wrong camera poses, and its remedy."""
 FIXED = "all views have the same pose, but do not show the same: give each its own"
@@ -528,7 +522,8 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         conventions.add(Z_UP)
     if Z_UP in usual:
         normals = np.array([transforms.rotate(v.pose, find_image_plane(v).normal_camera(v.K)) for v in thin])
-        if _median_angle(normals, np.median(normals, axis=0)) > max_tilt:
+        away = transforms.angle_between(normals, np.median(normals, axis=0))
+        if np.degrees(np.median(away)) > max_tilt:
             usual[Z_UP] = INCONSISTENT
     doubts, flat = list[str](), sum(row["plane"] >= LARGE for row in rows)
     if 2 * flat < len(rows):
@@ -581,11 +576,8 @@ def _have_one_pose(views: Sequence[View]) -> bool:
 def _explain_tilts(views: Sequence[View], sigma: float) -> tuple[str, float, bool]:
     """Say what tilts the tables of views alike, or ""; how far [deg]; and whether it is the world alone.
 
-    A camera turned on its arm, or with other focal lengths, tilts them in its own frame.
-
-    Args:
-        views: Views with poses.
-        sigma: Standard deviation of the orientation of a pose [deg].
+    A camera turned on its arm, or with other focal lengths, tilts them in its own frame. Poses are noisy by
+    sigma [deg].
     """
     planes = [(view, plane) for view in views if (plane := find_image_plane(view)).share >= LARGE]
     if len(planes) < 3:  # The turn of a camera explains nearly all of two.
@@ -609,11 +601,11 @@ def _explain_tilts(views: Sequence[View], sigma: float) -> tuple[str, float, boo
     mount, focal, tilted = (bool(cost - min(costs) < SURE) for cost in costs)
     by, tilt = np.degrees([turn.magnitude(), transforms.angle_between(mean, UP)]).tolist()
     vector = ", ".join(f"{x:.1f}" for x in turn.as_rotvec(degrees=True))
+    lost = ", perhaps forgotten or inverted" * (by > STEEP)
+    mended = f", or turn it on the right by Rotation.from_rotvec([{vector}], degrees=True)" * known
     causes = [
         f"all poses are off by the same turn of the camera, {'' if known else 'at least '}{by:.1f}°: the "
-        f"hand-eye calibration is wrong{', perhaps forgotten or inverted' * (by > STEEP)}: calibrate again"
-        + f", or turn it on the right by Rotation.from_rotvec([{vector}], degrees=True)"
-        * known
+        f"hand-eye calibration is wrong{lost}: calibrate again{mended}"
     ] * mount
     # Calibration leaves small turns; wrong focal lengths are those of another image.
     causes += [f"multiply the focal lengths by {factor:.2g}"] * (focal and (by >= MOUNTED or not mount))
@@ -628,7 +620,7 @@ def _find_turn(vectors: Array, others: Array, sigma: float) -> tuple[Rotation, b
     """
     turn, rank = Rotation.identity(), 0
     # From the mean of all to the median, on which a few walls have no influence.
-    for tolerance in np.geomspace(np.pi, sigma, STEPS):
+    for tolerance in np.geomspace(np.pi, sigma):
         turned = turn.apply(vectors)
         weights = 1.0 / np.maximum(transforms.angle_between(turned, others), tolerance)
         # A small turn q moves each vector v by the part of q across v.
@@ -637,11 +629,6 @@ def _find_turn(vectors: Array, others: Array, sigma: float) -> tuple[Rotation, b
         q, _, rank, _ = np.linalg.lstsq(rows.reshape(-1, 3), values.ravel(), rcond=0.1)
         turn = Rotation.from_rotvec(q) * turn
     return turn, bool(rank == 3)
-
-
-def _median_angle(a: Array, b: Array) -> float:
-    """Median angle [deg] between vectors (N, 3)."""
-    return float(np.degrees(np.median(transforms.angle_between(a, b))))
 
 
 def _is_level_somewhere(view: View, max_tilt: float) -> bool:

@@ -94,10 +94,8 @@ class View(Pictured):
             bad = "infinite" if np.isinf(depth).any() else "negative"
             raise InputError(name, f"depth contains {bad} values", "mark missing readings with 0 or NaN")
         if depth.max() > AWAY and (far := float(np.median(depth[depth > 0.0]))) > AWAY:
-            unit = describe_unit(depth[depth > 0.0])
-            raise WrongViewError(
-                name, f"depth is about {far:.4g} m{unit}", f"give depth in metres{undo_unit(unit)}"
-            )
+            reason = f"depth is about {far:.4g} m{(unit := describe_unit(depth[depth > 0.0]))}"
+            raise WrongViewError(name, reason, f"give depth in metres{undo_unit(unit)}")
         # Anything nearer than a micrometre is not a reading, and its inverse may be infinite.
         depth = np.where(depth < 1e-6, np.float32(0.0), depth)
         assign("depth", depth)

@@ -119,21 +119,19 @@ def _why(samples: Samples, gain: Array, graph: SupportGraph) -> str:
         return "no view is expected to show anything hidden; this one is the cheapest"
     worth: dict[str, float] = {}
     shares = np.bincount(samples.subjects, weights=gain, minlength=len(samples.names))
-    for name, share in zip(samples.names, shares, strict=True):
+    names = [_placed(samples, gain, graph) if name == SPACE else name for name in samples.names]
+    for name, share in zip(names, shares, strict=True):
         worth[name] = worth.get(name, 0.0) + float(share)
     ranked = sorted(worth.items(), key=lambda item: -item[1])[:3]
-    parts = [
-        f"{name + _near(samples, gain, graph) if name == SPACE else name} ({share / total:.0%})"
-        for name, share in ranked
-        if share > WORTH_SAYING * total
-    ]
+    parts = [f"{name} ({share / total:.0%})" for name, share in ranked if share > WORTH_SAYING * total]
     return "expected to reveal the most: " + ", ".join(parts)
 
 
-def _near(samples: Samples, gain: Array, graph: SupportGraph) -> str:
-    """Name the object nearest to the most of the unseen space that a view shows, as seen from above."""
+def _placed(samples: Samples, gain: Array, graph: SupportGraph) -> str:
+    """Name the object nearest, seen from above, to the most of the unseen space that a view shows."""
     objects = graph.movable
     space = np.isin(samples.names, [SPACE])[samples.subjects]
-    offsets = samples.points_world[space, None] - np.array([o.centre_world for o in objects]).reshape(-1, 3)
+    offsets = samples.points_world[space, None] - np.array([o.centre_world for o in objects])
     nearest = np.linalg.norm(offsets[:, :, :2], axis=2).argmin(axis=1)
-    return f" near {objects[np.bincount(nearest, weights=gain[space]).argmax()].id}"
+    most = np.bincount(nearest, weights=gain[space], minlength=len(objects)).argmax()
+    return f"{SPACE} near {objects[most].id}"
