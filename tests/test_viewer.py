@@ -165,7 +165,7 @@ def test_the_sphere_is_painted_and_cameras_show_what_they_saw(step, drawn):
 
 
 def test_the_panel_says_why_an_object_has_its_shape(page, step, settings):
-    text = describe_object(step.graph, "o1", settings.support, reasons=page.why("o1"))
+    text = describe_object(step.graph, "o1", settings.support, reasons=page.find_scene().why("o1"))
     cost = r"Why a box</dt><dd>it costs \d+ nats: points \d+, free space 0, parameters \d+<"
     assert re.search(cost, text)
     assert re.search(r"a cylinder instead</dt><dd>\+\d+ nats", text)

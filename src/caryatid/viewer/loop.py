@@ -75,7 +75,7 @@ class LoopPage(Page):
         self.planner, self._masks = planner, masks
         self._begin()
         super().__init__(f"caryatid: {self.source.name}", config, host=host, port=port, seed=seed)
-        self.why = lambda object_id: self._explorer.scene.why(object_id)
+        self.find_scene = lambda: self._explorer.scene
         self._add_controls()
 
     def _begin(self) -> None:

@@ -21,7 +21,6 @@ from caryatid.exploration import Step
 from caryatid.geometry import transforms
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.order import Order, plan_order
-from caryatid.objects.reasons import Reasons
 from caryatid.runtime.parallel import cores
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import direction
@@ -55,7 +54,8 @@ class Page:
         drawing: The scene in the page.
         steps: The steps added so far.
         scores: F1 after each step, or None without ground truth.
-        why: Says why an object of the newest step has its shape, or None: then only its last step tells.
+        find_scene: Returns the scene model after the newest step, or None: then only steps tell why objects
+            have their shapes, and which space was seen free.
         working: Lock for computing: two threads would change each other's number of BLAS threads.
 
     Raises:
@@ -77,7 +77,7 @@ class Page:
         self.server, self.url = self._door.server, self._door.url
         self.steps: list[Step] = []
         self.scores: list[float | None] = []
-        self.why: Callable[[str], Reasons] | None = None
+        self.find_scene: Callable[[], Scene] | None = None
         self.drawing = drawing.SceneDrawing(self.server, self.describe)
         self._config, self._seed, self._small = config or Config(), seed, small
         self._shown, self._chosen = -1, ""
@@ -115,7 +115,7 @@ class Page:
     def update(self, scene: Scene) -> None:
         """Add the current state of a scene; the slider goes back to earlier states."""
         if scene.views:
-            self.why = scene.why
+            self.find_scene = lambda: scene
             self.add(drawing.step_of_scene(scene))
 
     def show_layer(self, name: str, visible: bool) -> None:
@@ -169,12 +169,15 @@ class Page:
         Raises:
             CaryatidError: There is nothing to lift.
         """
-        graph, goal = self.steps[self._shown].graph, None if self._goal.value == ALL else self._goal.value
+        step, goal = self.steps[self._shown], None if self._goal.value == ALL else self._goal.value
+        graph, voxels = step.graph, step.voxels
+        if self.find_scene is not None and step is self.steps[-1]:
+            voxels = self.find_scene().voxels
         gripper = choose_gripper(self._gripper.value, self._config.gripper)
         config = replace(self._config, gripper=gripper)
         named = f"gripper {self._gripper.value}, goal {self._goal.value}"
         with self.working:
-            order = plan_order(graph, config, goal=goal, seed=self._seed, threads=cores())
+            order = plan_order(graph, config, goal=goal, seed=self._seed, threads=cores(), voxels=voxels)
         self._planned = graph, order, gripper, named
         return ""
 
@@ -403,8 +406,8 @@ class Page:
         """Describe an object, and why it has its shape if that is known."""
         reasons = next((each for each in step.reasons if each.subject == (object_id,)), None)
         with self.working, contextlib.suppress(InputError):
-            if self.why is not None and self.steps and step is self.steps[-1]:
-                reasons = self.why(object_id)
+            if self.find_scene is not None and self.steps and step is self.steps[-1]:
+                reasons = self.find_scene().why(object_id)
         with self.working:
             graph, config = step.graph, self._config.support
             return panels.describe_object(graph, object_id, config, taken=taken, reasons=reasons)

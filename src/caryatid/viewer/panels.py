@@ -83,8 +83,8 @@ def describe_lifts(graph: SupportGraph, order: Order | None, lifts: Sequence[Tak
         hint = "Plan an order to see what to lift first, and how surely nothing else moves."
         parts.append(cell_html(Section("", hint)))
     else:
-        text = " ".join(describe_order(order, graph))
-        parts.append(cell_html(Section(f"Order, {asked}", text, facts=_list_lifts(order, graph))))
+        text = f"{asked}: {' '.join(describe_order(order, graph))}"
+        parts.append(cell_html(Section("Order", text, facts=_list_lifts(order, graph))))
     return "".join(parts)
 
 
