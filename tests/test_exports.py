@@ -17,7 +17,6 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from synthetic import model_of, shelf_graph, simulated_views
 
-from caryatid.config import ExportConfig
 from caryatid.errors import InputError
 from caryatid.exports import export_graph, planning_scene
 from caryatid.geometry import transforms
@@ -444,8 +443,6 @@ def test_an_impossible_export_ends_in_one_line(tmp_path, graph, capsys):
     assert run_command("export", tmp_path / "no-run", "--out", tmp_path / "s.xml") == 1
     assert "no such folder" in capsys.readouterr().err
     assert run_command("export", tmp_path, "--format", "step", "--out", tmp_path / "s.step") == 2
-    with pytest.raises(InputError, match="objects, more than export"):
-        export_graph(graph, tmp_path / "a.dot", ExportConfig(max_objects=1))
     with pytest.raises(InputError, match="has no objects"):
         export_graph(SupportGraph(), tmp_path / "s.glb")
     named = replace(graph, objects=(replace(graph.objects[1], id="world"),), supports=())

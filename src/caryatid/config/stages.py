@@ -610,8 +610,6 @@ class ExportConfig:
     """Number of corners of a cylinder's ends in meshes [1]; the radius is then accurate to 0.2 %."""
     frame: str = "world"
     """Name of the world frame in tf, for MoveIt."""
-    max_objects: Count = 2000
-    """Maximum number of objects [1]; MuJoCo loads this many in 2 s, and at most about 4,000."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

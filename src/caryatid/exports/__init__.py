@@ -62,9 +62,9 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
     """Write a scene model in the format of the file's suffix, whole or not at all; replace an existing file.
 
     Raises:
-        InputError: The suffix is unknown, the file is a graph.json or run.json, there is nothing to export or
-            too much, the format rejects the name of an object, the extra of a format is not installed, or the
-            file cannot be written.
+        InputError: The suffix is unknown, the file is a graph.json or run.json, there is nothing to export,
+            the format rejects the name of an object, the extra of a format is not installed, or the file
+            cannot be written.
     """
     path, config = Path(path), config or ExportConfig()
     chosen = FORMATS[format_of(path)]
@@ -72,9 +72,6 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
         raise InputError(path, "holds a scene model or run, which would be lost", "give another file")
     if not graph.objects:
         raise InputError("the scene model", "has no objects", "give a graph with objects")
-    if len(graph.objects) > config.max_objects:
-        reason = f"has {len(graph.objects):,} objects, more than export.max_objects = {config.max_objects:,}"
-        raise InputError("the scene model", reason, "raise that setting")
     content = chosen.write(graph, config, path.suffix.lower())
     write_file(path, content.encode() if isinstance(content, str) else content)
 
