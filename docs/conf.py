@@ -70,7 +70,7 @@ nitpick_ignore_regex = [
 
 for kept in (DOCS / "results").glob("*.json.gz"):
     page = kept.name.replace("json.gz", "md")
-    write_document(*read_results(kept), DOCS / page, f"caryatid benchmark --out results --docs {page}")
+    write_document(*read_results(kept), DOCS / page, "caryatid benchmark --out results")
 
 copy_examples(DOCS.parent / "examples", DOCS / "_build" / "examples")
 sphinx_gallery_conf = {

@@ -137,10 +137,8 @@ class SuiteResult:
             yield f"{self.name}, {condition}: {method} against {self.reference}: {figures}, {said}"
 
 
-def write_report(
-    store: ResultStore, folder: Path, *, reference: str | None = None, document: Path | None = None
-) -> list[SuiteResult]:
-    """Write tables, figures and a page of all results, and a Markdown document if asked for.
+def write_report(store: ResultStore, folder: Path, reference: str | None = None) -> list[SuiteResult]:
+    """Write tables, figures and a page of all results.
 
     Returns:
         The suites with at least one episode.
@@ -159,8 +157,6 @@ def write_report(
             command += f" --reference {shlex.quote(reference)}"
         write_results(results, store.about, folder / "summary.json.gz")
         _write_page(results, store.about, folder, command)
-        if document is not None:
-            write_document(results, store.about, document, f"{command} --docs {document.name}")
     return results
 
 

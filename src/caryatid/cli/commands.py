@@ -355,8 +355,6 @@ class Benchmark(options.Command, work="results:compare_methods"):
     """Run failed episodes again."""
     reference: Annotated[str | None, options.shown("METHOD")] = None
     """Method that the others are compared with, instead of the suite's or, without that one, the first."""
-    docs: Annotated[Path | None, options.shown("FILE.md")] = None
-    """Also write the results as a Markdown document."""
 
 
 class SessionStep(options.ComputingCommand):

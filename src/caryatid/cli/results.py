@@ -334,7 +334,7 @@ def _run_episodes(command: Benchmark, suite: str, missing: list[Episode], store:
 def _report_benchmark(command: Benchmark, store: ResultStore) -> None:
     """Write tables, figures and pages, and print the summary."""
     output, suites = command.output, {}
-    for each in write_benchmark(store, command.out, reference=command.reference, document=command.docs):
+    for each in write_benchmark(store, command.out, command.reference):
         done, failed = each.episodes, len(each.failures)
         suites[each.name] = {"planned": each.planned, "done": done, "failed": failed, "f1": each.f1()}
         output.say(
