@@ -326,16 +326,13 @@ TF = (*TOPICS, "--tf", WORLD)
 
 
 @pytest.mark.parametrize("fixed", [(MOUNT, DRIVER), (DRIVER, MOUNT)])
-def test_of_two_parents_the_one_in_the_world_is_used_whatever_the_order(tmp_path, views, capsys, fixed):
+def test_of_two_parents_the_one_in_the_world_is_used_whatever_the_order(tmp_path, views, fixed):
     read = imported(tmp_path, tf_bag(tmp_path / "tf.bag", views, *fixed), *TF)
     for view, before in zip(read, views, strict=True):
         assert np.allclose(view.T_world_camera, before.T_world_camera, atol=1e-6)
-    assert "'base' leads to 'map' and is used, 'camera_link' does not" in capsys.readouterr().err
 
 
-def test_transforms_that_contradict_each_other_do_not_meet_or_have_another_clock(
-    tmp_path, views, capsys, unfit
-):
+def test_transforms_that_contradict_each_other_do_not_meet_or_have_another_clock(tmp_path, views, unfit):
     shifted = transforms.rigid(np.eye(3), (0.0, 0.0, 0.02))
     loop = [(BASE, "camera_link", T_BASE_LENS @ shifted), MOUNT, DRIVER]
     said = "frame 'optical' has two parents, 'base' and 'camera_link', that place it differently"
@@ -348,7 +345,6 @@ def test_transforms_that_contradict_each_other_do_not_meet_or_have_another_clock
     moved = tf_bag(tmp_path / "moved.bag", views, (BASE, LENS, T_BASE_LENS @ shifted), MOUNT)
     shutil.rmtree(tmp_path / "out")
     assert np.allclose(imported(tmp_path, moved, *TF)[0].T_world_camera, views[0].T_world_camera, atol=1e-6)
-    assert "'optical' has several fixed poses in 'base'; the last is used" in capsys.readouterr().err
     said = "transforms of 'base' share no time: the former begin 3600.0 s earlier"
     unfit(tf_bag(tmp_path / "late.bag", views, MOUNT, late=3600 * SECOND), *TF, says=said)
 

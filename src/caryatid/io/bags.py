@@ -79,12 +79,12 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     else:
         poses = bag.transforms(config.pose_gap), options.world
         for frame in dict.fromkeys(depth.frame or cameras[0].frame for depth in depths):
-            notes += _check_way(path, frame, *poses)
+            _check_way(path, frame, *poses)
     return make_video(path, depths, colours, cameras, poses, config, notes)
 
 
-def _check_way(path: Path, frame: str, tree: TransformTree, world: str) -> list[str]:
-    """Check that transforms connect a camera's frame with the world, and list the parents that do not."""
+def _check_way(path: Path, frame: str, tree: TransformTree, world: str) -> None:
+    """Check that transforms connect a camera's frame with the world."""
     if not tree.frames:
         raise InputError(path, "has no transforms", "record /tf and /tf_static, or omit --tf")
     if not frame:
@@ -100,17 +100,6 @@ def _check_way(path: Path, frame: str, tree: TransformTree, world: str) -> list[
         reason = f"no transform connects '{world}' with '{frame}': the roots are '{root}' and '{top}'"
         remedy = f"record the transform from '{root}' to '{top}', or give --tf {top} (with --level if tilted)"
         raise InputError(path, reason, remedy)
-    notes = []
-    for child in above:
-        lost = [parent for parent in tree.parents(child) if reached.isdisjoint(tree.ancestors(parent))]
-        used = [parent for parent in tree.parents(child) if parent not in lost]
-        if child in tree.moved:
-            words = f"frame '{child}' has several fixed poses in '{tree.moved[child]}'"
-            notes.append(f"{words}; the last is used")
-        if lost and used:
-            words = f"frame '{child}' has several parents: '{used[0]}' leads to '{world}' and is used"
-            notes.append(f"{words}, '{lost[0]}' does not")
-    return notes
 
 
 class _Bag:

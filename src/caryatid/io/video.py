@@ -184,16 +184,12 @@ class TransformTree:
     """Poses of frames in their parents over time, interpolated across gaps of at most `max_gap` [s].
 
     A frame may have several parents, as when a driver and a calibration both publish it. Errors use the name.
-
-    Attributes:
-        moved: Frames that have several fixed poses in the same parent, and that parent.
     """
 
     def __init__(self, max_gap: float, name: str = "transforms") -> None:
         self._name = name
         self._max_gap = round(max_gap * SECOND)
         self._links: defaultdict[str, defaultdict[str, _Link]] = defaultdict(lambda: defaultdict(_Link))
-        self.moved: dict[str, str] = {}
 
     @property
     def frames(self) -> list[str]:
@@ -212,10 +208,7 @@ class TransformTree:
         """
         link = self._links[child][parent]
         if fixed:
-            T_parent_child = transforms.rigid(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
-            if link.fixed is not None and not np.allclose(T_parent_child, link.fixed, atol=1e-3):
-                self.moved[child] = parent
-            link.fixed = T_parent_child
+            link.fixed = transforms.rigid(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
         else:
             link.times.append(time)
             link.numbers.extend(pose)
