@@ -230,6 +230,7 @@ class Scene(Pictured):
         goal: str | None = None,
         gripper: str | GripperConfig | None = None,
         hands: int = 1,
+        risk: float | None = None,
         steps: int | None = None,
         threads: int | None = None,
     ) -> Order:
@@ -242,6 +243,7 @@ class Scene(Pictured):
             gripper: Kind or name of a gripper, such as `franka`, or its settings; None = that of the
                 configuration, without which every object can be grasped.
             hands: 2 if another hand can hold one object, else 1.
+            risk: Maximum probability that a lift moves another object [1]; None = that of the configuration.
             steps: Maximum number of steps; None = all.
             threads: Number of parallel rehearsals; None = all cores.
 
@@ -259,7 +261,11 @@ class Scene(Pictured):
         if isinstance(gripper, str):
             gripper = choose_gripper(gripper, self.config.gripper)
         check_type("gripper", gripper, (GripperConfig, NoneType), "give a name or a caryatid.Gripper")
-        config = replace(self.config, gripper=gripper or self.config.gripper)
+        if not self.graph.objects:
+            raise InputError("scene", "has no views", "update it with a first view")
+        rehearsal = self.config.rehearsal
+        rehearsal = rehearsal if risk is None else replace(rehearsal, risk=risk)
+        config = replace(self.config, gripper=gripper or self.config.gripper, rehearsal=rehearsal)
         order: Order = call(
             "order", self.graph, config, goal=goal, hands=hands, steps=steps, seed=self.seed,
             threads=cores() if threads is None else threads, voxels=self.voxels,

@@ -259,6 +259,7 @@ class Report(options.LiftingCommand, options.Command, work="results:redraw_repor
     """Run folder or session; its report.html is replaced."""
     pdf: Annotated[Path | None, options.shown("FILE.pdf")] = None
     """Also write a PDF (A4); replaces an existing file."""
+    settings: options.Settings = options.Settings()
 
 
 class Describe(options.Command, work="results:describe_model"):

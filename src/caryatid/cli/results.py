@@ -33,10 +33,9 @@ from caryatid.cli.commands import (
     Report,
     Why,
 )  # fmt: skip
-from caryatid.cli.options import LiftingCommand, Settings
 from caryatid.cli.output import kept, table
 from caryatid.config import Config
-from caryatid.errors import InputError
+from caryatid.errors import GoalError, InputError
 from caryatid.evaluation.truths import evaluate_run
 from caryatid.exports import export_graph, format_of
 from caryatid.exports.streams import STREAMS, Stream
@@ -44,12 +43,14 @@ from caryatid.io.datasets import OpenOptions, open_dataset
 from caryatid.io.importing import import_recording, levelled, reasons
 from caryatid.io.staging import write_file
 from caryatid.manipulation import order as orders
+from caryatid.objects.reasons import Reasons
 from caryatid.runtime import fingerprint
 from caryatid.runtime.parallel import cores
 from caryatid.segmentation.diagnosis import diagnose
+from caryatid.sessions.session import is_session
 from caryatid.simulation.warm_up import is_warm
 from caryatid.sources import kind_of, open_run, read_model, read_scene
-from caryatid.steps import Run, read_config, read_steps
+from caryatid.steps import Run, read_config, read_run, read_steps
 from caryatid.viz.check_report import SHOWN, make_check_report
 from caryatid.viz.report import find_chromium, make_report, print_pdf, read_lift, render_html
 from caryatid.viz.tables import (
@@ -209,8 +210,10 @@ def tell_reasons(command: Why) -> None:
     if len(command.objects) not in (1, 2):
         given = count_of(len(command.objects), "id")
         raise InputError("ID", f"{given} of objects given", "give one, or two to ask why they are two")
-    with command.output.working("looking at all views again"):
-        reasons = read_scene(command.run).why(*command.objects)
+    reasons = None if len(command.objects) > 1 else _read_reasons(command.run, command.objects[0])
+    if reasons is None:
+        with command.output.working("looking at all views again"):
+            reasons = read_scene(command.run).why(*command.objects)
     terms = ("points", "free", "parameters", "border", "others", "total")
     rows = [[option.what, *(f"{getattr(option, term):.0f}" for term in terms)] for option in reasons.options]
     heads = ["explanation", "points", "free\nspace", "parameters", "border", "colours,\nviews", "total"]
@@ -219,8 +222,17 @@ def tell_reasons(command: Why) -> None:
     command.output.result(reasons.to_json(), table(title, heads, rows, figures=True), notes)
 
 
+def _read_reasons(path: Path, word: str) -> Reasons | None:
+    """Read why an object of a run is what it is, as its last step tells; None if it does not."""
+    if is_session(path):
+        return None
+    run = read_run(path)
+    known = run.views[-1].load_step().reasons
+    return next((reasons for reasons in known if reasons.subject == (run.graph.find_id(word),)), None)
+
+
 def write_report(
-    folder: Path, pdf: Path | None = None, asked: LiftingCommand | None = None
+    folder: Path, pdf: Path | None = None, asked: Report | None = None
 ) -> tuple[list[Path], list[str]]:
     """Draw the report of a run or session; write its report.html, and a PDF if asked for.
 
@@ -236,7 +248,7 @@ def write_report(
     with open_run(folder) as run:
         config, record = read_config(run), run.record
         if asked is not None:
-            config = Settings().read(*asked.lift_settings(), base=config)
+            config = asked.settings.read(*asked.lift_settings(), base=config)
         settings = {"source": record["source"], "seed": record["seed"]} | record["options"]
         settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
         made_by = f"caryatid {record.get('versions', {}).get('caryatid', '')}".rstrip()
@@ -246,6 +258,8 @@ def write_report(
             try:
                 order = _plan_order(run, config, asked)
                 answer += describe_order(order, run.graph)
+            except GoalError:
+                raise
             except InputError as error:
                 answer += [f"No lift was rehearsed. {sentence(str(error))}"]
         report = make_report(
@@ -268,7 +282,7 @@ def write_report(
     return list(files), answer
 
 
-def _plan_order(run: Run, config: Config, asked: LiftingCommand | None) -> orders.Order:
+def _plan_order(run: Run, config: Config, asked: Report | None) -> orders.Order:
     """Plan what to remove after a run, as asked for, or as its command was; ignore a goal that is unknown."""
     options, graph, seed = run.record["options"], run.graph, run.record["seed"]
     goal, hands, reachable = run.record.get("goal") or options.get("goal"), options.get("hands", 1), None

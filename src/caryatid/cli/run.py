@@ -230,11 +230,14 @@ def _check_found(goal: str | None, last: Step) -> None:
         raise GoalError(f"--goal {goal}", reason, last.graph.suggest(goal))
 
 
-def _conditions(command: Explore | Extract | Clear) -> str:
-    """Source of the segments, and noise of a simulation."""
-    simulated = kind_of(command.source) == "scene"
-    masks = command.settings.masks_from or ("simulator" if simulated else "from the source, if any")
-    text = "segments: automatic" if command.segmentation == "auto" else f"masks: {masks}"
+def _conditions(command: Explore | Extract | Clear, first: Step) -> str:
+    """Tell where the segments of a run with this first step come from, and the noise of a simulation."""
+    simulated, given = kind_of(command.source) == "scene", command.settings.masks_from
+    text = "segments: automatic"
+    if command.segmentation != "auto":
+        text = f"masks: {given or ('simulator' if simulated else 'of the source')}"
+        if first.view is not None and first.view.labels is None:
+            text = "segments: automatic, because the source has no masks"
     return text if isinstance(command, Extract) or not simulated else f"{text}, noise: {command.noise}"
 
 
@@ -268,16 +271,14 @@ def _finish(
     answer = _draw_report(command)
     _check_found(goal, last)
     output.say(f"{name}: {census(last.graph)} after {count_of(len(writer.steps), 'view')}")
-    for line in answer:
-        output.say(line)
-    output.say(f"run: {command.out}" if command.no_report else f"report: {command.out / 'report.html'}")
-    program, out = "caryatid" if which("caryatid") else sys.argv[0], quote(str(command.out))
-    output.say(f"next: {program} order {out}, or {program} view {out}")
     document: dict[str, Any] = {"run": str(command.out), "stop": last.stop}
     if last.removal is not None:
         document["removal"] = last.removal.to_json()
     document |= {"graph": graph_to_json(last.graph), "warnings": output.warnings}
-    output.result(document, "")
+    output.result(document, "" if command.general.quiet else "".join(f"{line}\n" for line in answer))
+    output.say(f"run: {command.out}" if command.no_report else f"report: {command.out / 'report.html'}")
+    program, out = "caryatid" if which("caryatid") else sys.argv[0], quote(str(command.out))
+    output.say(f"next: {program} order {out} --gripper franka, or {program} view {out}")
 
 
 def _record(
@@ -289,9 +290,11 @@ def _record(
     stream: Stream | None = None,
 ) -> Step:
     """Score, save, print and show every step; return the last."""
-    output, last, conditions = command.output, None, _conditions(command)
-    writer.more |= {"conditions": conditions, "warnings": output.warnings}
+    output, last = command.output, None
     for step in steps:
+        if last is None:
+            conditions = _conditions(command, step)
+            writer.more |= {"conditions": conditions, "warnings": output.warnings}
         scored = None if truth is None else score(step.graph, truth)
         writer.add(step, None if scored is None else asdict(scored))
         if last is None:

@@ -41,6 +41,7 @@ def _few_voxels(extent: tuple[float, float, float], info: ValidationInfo) -> tup
 Positive = Annotated[float, Field(gt=0, le=1e18)]
 NotNegative = Annotated[float, Field(ge=0, le=1e18)]
 Length = Annotated[float, Field(gt=0, le=1000)]
+HandSize = Annotated[float, Field(gt=0, le=1)]
 """A longer one is no room; in its square, that of the smallest error of depth would be rounded away."""
 Distance = Annotated[float, Field(ge=0, le=1000)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -657,34 +658,35 @@ class GripperConfig:
 
     kind: GripperKind = "none"
     """Parallel jaw or suction disc; with none, every object can be grasped."""
-    opening: Length = 0.14
+    opening: HandSize = 0.14
     """Maximum opening of a parallel jaw [m]."""
-    finger: Length = 0.014
+    finger: HandSize = 0.014
     """Thickness of a finger along the closing direction, and half of its breadth [m]."""
-    length: Length = 0.06
+    length: HandSize = 0.06
     """Length of the fingers, or of the tube behind the disc [m]."""
-    hand: Length = 0.08
+    hand: HandSize = 0.08
     """Length of the hand behind them, and its depth across the closing direction [m]."""
-    breadth: Distance = 0.0
+    breadth: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Breadth of the hand along the closing direction [m], at least the opening and both fingers."""
     turn: Annotated[float, Field(ge=-180.0, le=180.0)] = 0.0
     """Angle about the approach from the closing direction to the x axis of the gripper's own frame [deg]."""
-    disc: Length = 0.015
+    disc: HandSize = 0.015
     """Radius of a suction disc [m]."""
     tilt: Acute = 60.0
     """Maximum angle between approach and straight down [deg]; flatter, the wrist hits the table."""
-    clearance: Length = 0.005
+    clearance: HandSize = 0.005
     """Minimum distance from other objects, and of an open finger from its object [m]: the error of a fit."""
-    travel: Length = 0.1
+    travel: HandSize = 0.1
     """Length of the straight approach, and of the lift along which the gripper touches nothing [m]."""
     seen: Share = 0.95
     """Minimum share of the space along the approach that was seen to be free [1]; the rest is noise."""
 
     @property
     def title(self) -> str:
-        """What lifts, in words, such as `with a parallel gripper, opening 80 mm`; empty without a gripper."""
+        """What lifts, such as `with a franka gripper, opening 80 mm`; empty without a gripper."""
+        name = next((name for name, known in GRIPPERS.items() if known == self), self.kind)
         jaw = f", opening {1e3 * self.opening:.0f} mm" if self.kind == "parallel" else ""
-        return "" if self.kind == "none" else f"with a {self.kind} gripper{jaw}"
+        return "" if self.kind == "none" else f"with a {name} gripper{jaw}"
 
 
 Gripper = GripperConfig

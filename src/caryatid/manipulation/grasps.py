@@ -130,7 +130,7 @@ def find_grasp(
         return Blocked(tuple(fewest), ", ".join(told))
     if most >= 0.0:
         seen = f"at most {100.0 * most // 1.0:.0f}% of the gripper's way was seen to be free"
-        return Blocked((), f"{seen}, less than {gripper.seen:.0%}")
+        return Blocked((), f"{seen}, less than {gripper.seen:.0%}: look at the space around and above it")
     return Blocked((), "it is too large for the hand")
 
 

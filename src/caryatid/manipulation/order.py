@@ -156,6 +156,8 @@ def plan_order(
         unchecked = "whether a gripper can grasp the objects, because none is given"
     elif voxels is None:
         unchecked = "whether the gripper's path was seen to be free, because it is not known which space was"
+    elif any(step.hold for step in found):
+        unchecked = "whether the other hand can grasp what it holds"
     return Order(tuple(found), refusal, rehearsal.risk, unchecked, gripper)
 
 

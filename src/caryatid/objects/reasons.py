@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from caryatid.objects.description_length import (
     Evidence,
     Explanation,
     best_compound,
+    explained,
     free_cost,
     point_costs,
     price,
@@ -92,6 +93,14 @@ def explain_object(
     compound = best_compound(evidence, config, np.inf).shape
     shapes = {_name(shape): shape for shape in (None, compound, *(f.shape for f in fits), explanation.shape)}
     options = {name: _option(name, [(shape, evidence)], config) for name, shape in shapes.items()}
+    own = options[_name(explanation.shape)]
+    if (
+        compound is not None
+        and explained(explanation, evidence, config.explanation)
+        and options[_name(compound)].total < own.total
+    ):
+        note = f"not looked for, because {own.what} explains the points within their noise"
+        options[_name(compound)] = replace(options[_name(compound)], note=note)
     hints = evidence.shown(config.split.min_points)
     if (two := best_division(evidence, explanation, hints, config, rng)) is not None:
         sides = zip(two.explanations, (~two.second, two.second), strict=True)

@@ -90,10 +90,8 @@ def describe_lifts(graph: SupportGraph, order: Order | None, lifts: Sequence[Tak
 
 def _list_lifts(order: Order, graph: SupportGraph) -> list[tuple[str, str]]:
     """List the steps of an order: number and object, and how safe it is to lift it."""
-    rows = [[entry.text for entry in row] for row in order_table(order, graph).rows]
-    return [
-        (f"{row[0]}. {row[1]}", f"{row[3]}; {f'hold {row[2]}; ' * (row[2] != '–')}{row[4]}") for row in rows
-    ]
+    rows = ([entry.text for entry in row] for row in order_table(order, graph).rows)
+    return [(f"{number}. {name}", f"{likely}; {why}") for number, name, likely, why in rows]
 
 
 def draw_linked_graph(graph: SupportGraph, chosen: str, address: str) -> str:

@@ -58,7 +58,8 @@ if TYPE_CHECKING:
 
 SUPPORTS = (
     "Arrows run from supporter to supported, labelled with the probability of the support; thicker is more "
-    "probable. Dashed arrows are doubtful; an object with a dashed outline has no known supporter."
+    "probable. Dashed arrows are doubtful; an object with a dashed outline has no known supporter. 2/3: "
+    "found in 2 of the 3 views that could show it."
 )
 """Caption of a support graph."""
 WIDE = 680.0
@@ -236,11 +237,12 @@ def _answer(
     solid, still = draw_cloud(step.cloud, graph, azimuth), "All points, with the fitted shapes."
     seen = Figure("Fused cloud", solid, still)
     if shown.view is not None:
-        caption = f"View {shown.index + 1} with the final shapes; objects with pale names are not visible."
+        caption = f"View {shown.index + 1}, tinted by its segments, with the final shapes of all views; "
+        caption += "objects with pale names are not visible."
         seen = Figure("The objects", draw_image(shown.view, shown.labels, graph, width), caption)
     yield Section("Answer", text, [supports, seen] if supports.share == 1 else [seen, supports], facts)
-    if order is not None and order.steps:
-        yield Section("Order", tables=[order_table(order, graph)])
+    if order is not None and (steps := order_table(order, graph, brief=True)).rows:
+        yield Section("Order", tables=[steps])
     doubtful = [(lead, why) for lead, why, _ in doubts(graph)]
     text = f"Nothing: all supports and objects have a probability above {DOUBTFUL}, and all shapes fit."
     if any(s.probability is None for s in graph.supports):

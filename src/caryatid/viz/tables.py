@@ -105,6 +105,7 @@ def reason_table(reasons: Sequence[Reasons], graph: SupportGraph) -> Table:
         (object_id,), (chosen, *others) = reason.subject, reason.options
         terms = (chosen.points, chosen.free, chosen.parameters, chosen.total)
         otherwise = f"{others[0].what} {others[0].total - chosen.total:+.0f}" if others else "–"
+        otherwise += f" ({others[0].note})" if others and others[0].note else ""
         rows.append((shown[object_id], chosen.what, *(f"{nats:.0f}" for nats in terms), otherwise))
     columns = ("object", "explanation", "points", "free space", "parameters", "total", "next best")
     return Table.of("Why these shapes: costs in nats", columns, rows)
@@ -125,9 +126,7 @@ def describe_order(order: Order, graph: SupportGraph | None = None) -> list[str]
 
     Objects have the names of a graph, if it is given.
     """
-    names = {} if graph is None else {o.id: o.title for o in graph.objects}
-    held = (f" (hold {' and '.join(names.get(i, i) for i in s.hold)})" * bool(s.hold) for s in order.steps)
-    listed = [names.get(s.object_id, s.object_id) + hold for s, hold in zip(order.steps, held, strict=True)]
+    listed = _name_lifts(order, graph)
     safe = next((k for k, step in enumerate(order.steps) if not step.safe), len(listed))
     lead = "safe order" if order.safe else "safe as far as it goes"
     if safe < len(listed):
@@ -144,21 +143,27 @@ def order_table(order: Order, graph: SupportGraph | None = None, *, brief: bool 
 
     Alike are safe steps with the lowest risk, without a hold or a grasp.
     """
-    names = {} if graph is None else {o.id: o.title for o in graph.objects}
+    listed = _name_lifts(order, graph)
     least = min((step.risk for step in order.steps), default=0.0) + 0.005
     rows = (
         (
             str(number),
-            Entry(names.get(step.object_id, step.object_id), object_colour(label_of(step.object_id))),
-            ", ".join(names.get(i, i) for i in step.hold) or "–",
+            Entry(listed[number - 1], object_colour(label_of(step.object_id))),
             Entry(f"{1.0 - step.risk:.2f}{'' if step.safe else ', too low'}", doubt=not step.safe),
             step.why,
         )
         for number, step in enumerate(order.steps, 1)
         if not brief or step.hold or step.grasp or not step.safe or step.risk > least
     )
-    columns = ("step", "remove", "hold", "probability", "reason")
+    columns = ("step", "remove", "probability", "reason")
     return Table.of(f"Steps {order.gripper}".strip(), columns, rows)
+
+
+def _name_lifts(order: Order, graph: SupportGraph | None) -> list[str]:
+    """Name what each step of an order lifts, and what the other hand holds."""
+    names = {} if graph is None else {o.id: o.title for o in graph.objects}
+    held = (f" (hold {' and '.join(names.get(i, i) for i in s.hold)})" * bool(s.hold) for s in order.steps)
+    return [names.get(s.object_id, s.object_id) + hold for s, hold in zip(order.steps, held, strict=True)]
 
 
 def describe_removed(lifts: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -297,12 +302,13 @@ def changes(before: Step | None, step: Step) -> list[str]:
     Those that were lifted, or `noticed` as removed, are not listed as gone.
     """
     known, now = {} if before is None else _supported(before.graph), _supported(step.graph)
+    names = {} if before is None else {o.id: o.title for o in before.graph.objects}
     lifts = [each.lift for each in (before, step) if each is not None and each.lift is not None]
     told = {lift.object_id for lift in lifts} | {c.object_id for c in step.changes if c.kind == "removed"}
     lines = {
-        "found": [f"{name} {text}" for name, text in now.items() if name not in known],
-        "now": [f"{name} {text}" for name, text in now.items() if known.get(name, text) != text],
-        "gone": [name for name in known if name not in now and name not in told],
+        "found": [text for id_, text in now.items() if id_ not in known],
+        "now": [text for id_, text in now.items() if known.get(id_, text) != text],
+        "gone": [names[id_] for id_ in known if id_ not in now and id_ not in told],
     }
     return [f"{kind}: {', '.join(items)}" for kind, items in lines.items() if items]
 
@@ -316,9 +322,13 @@ def _supported(graph: SupportGraph) -> dict[str, str]:
     for item in graph.objects:
         supporters = sorted(graph.supporters(item.id), key=lambda s: s.supporter)
         names = [
-            ("the table" if only and graph[s.supporter].role != "object" else s.supporter) + "?" * s.doubtful
+            ("the table" if only and graph[s.supporter].role != "object" else graph[s.supporter].title)
+            + "?" * s.doubtful
             for s in supporters
         ]
         if item.role == "object":
-            texts[item.id] = f"({item.shape.kind}) supported by {' and '.join(names) or 'something unseen'}"
+            held = f"supported by {' and '.join(names) or 'something unseen'}"
+            about = f"{item.id} ({item.shape.kind})"
+            about = f"{item.name} ({item.id}, {item.shape.kind})" if item.name else about
+            texts[item.id] = f"{about} {held}"
     return texts
