@@ -684,7 +684,8 @@ class GripperConfig:
     @property
     def title(self) -> str:
         """What lifts, such as `with a franka gripper, opening 80 mm`; empty without a gripper."""
-        name = next((name for name, known in GRIPPERS.items() if known == self), self.kind)
+        known = {} if self == GripperConfig(kind=self.kind) else GRIPPERS
+        name = next((name for name, gripper in known.items() if gripper == self), self.kind)
         jaw = f", opening {1e3 * self.opening:.0f} mm" if self.kind == "parallel" else ""
         return "" if self.kind == "none" else f"with a {name} gripper{jaw}"
 
