@@ -286,7 +286,7 @@ def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
         (tmp_path / "nowhere", scene_file.parent, "no such folder"),
         (run, tmp_path / "nowhere", "no such scene or recording"),
         (recording, scene_file.parent, "not a run or session"),
-        (run, recording, "gt.json: the file is missing"),
+        (run, recording, "has no gt.json, the ground truth to compare with"),
         (run, strange, "gt.json names 'ghost', which is not a body of the scene"),
         (run, tmp_path, "neither a scene nor a recording"),
         (broken, scene_file.parent, str(broken / "views/01/graph.json")),

@@ -342,7 +342,7 @@ class LiftingCommand:
             return None
         if config.gripper.kind == "none":
             reason = "is of no use without a gripper"
-            raise InputError(f"--reach {self.reach}", reason, "add --gripper parallel or --gripper suction")
+            raise InputError(f"--reach {self.reach}", reason, "add --gripper, such as --gripper franka")
         reachability = read_reachability(self.reach)
         reachability.check_use(self.reach, "gripper", "world")
         return reachability

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import RecordingConfig
-from caryatid.errors import InputError
+from caryatid.errors import InputError, did_you_mean
 from caryatid.geometry.transforms import Array
 from caryatid.segmentation.diagnosis import BODY, GL, ray_lengths
 from caryatid.sensing.views import View
@@ -201,7 +201,8 @@ def open_dataset(
     if known is None:
         bags = "a bag (.bag, .mcap, .db3, or a folder with metadata.yaml)"
         phones = "a recording of nerfstudio, Record3D or Stray Scanner"
-        remedy = f"give a BOP scene folder, {bags}, a TUM RGB-D folder with depth.txt, or {phones}"
+        meant = did_you_mean(str(path), DESCRIPTIONS)
+        remedy = f"{meant}give a BOP scene folder, {bags}, a TUM RGB-D folder with depth.txt, or {phones}"
         raise InputError(path, "unknown format" if path.exists() else "no such file or folder", remedy)
     config = config or RecordingConfig()
     dataset = known.open_dataset(path, config, options or OpenOptions())

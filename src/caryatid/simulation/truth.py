@@ -25,7 +25,7 @@ from caryatid.simulation.world import (
     strayed,
 )
 
-_REMEDY = 'write {"vertices": […], "edges": [{"supporter", "supported", "kind"}, …]}'
+_REMEDY = 'write in gt.json {"vertices": […], "edges": [{"supporter", "supported", "kind"}, …]}'
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +114,8 @@ def read_truth(path: Path) -> GroundTruth:
     Raises:
         InputError: The file is missing, is not JSON, or its edges or surfaces do not fit its vertices.
     """
+    if path.parent.is_dir() and not path.exists():
+        raise InputError(path.parent, f"has no {path.name}, the ground truth to compare with", _REMEDY)
     truth = parse_json(GroundTruth, read_json(path, _REMEDY), path, _REMEDY)
     if not truth.vertices:
         raise InputError(path, "'vertices' is empty", _REMEDY)
