@@ -83,12 +83,12 @@ def is_name(source: str) -> bool:
 
 
 class Model(NamedTuple):
-    """What is known of a scene: the graph, settings, seed, and which space was seen free, or None."""
+    """What is known of a scene: graph, settings, seed, and which space was seen free; None = unknown."""
 
     graph: SupportGraph
     config: Config
     seed: int
-    voxels: VoxelMap | None
+    space: VoxelMap | None
 
 
 def read_model(path: Path) -> Model:

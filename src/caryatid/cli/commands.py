@@ -294,7 +294,7 @@ class Why(options.Command, work="results:tell_reasons"):
 
 
 class Export(options.Command, work="results:export_model"):
-    """Export the scene model of a run to simulators, 3D viewers, motion and task planners, and graph tools.
+    """Export the scene model of a run to simulators, 3D viewers, motion planners, and graph tools.
 
     With the suffix .rrd or .mcap, export every view of the run, for Rerun or Foxglove.
 
