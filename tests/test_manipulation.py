@@ -347,6 +347,8 @@ class TestGrasps:
         assert "gripper's 30 mm" in scene.order(gripper="parallel").refusal, "a kind keeps the settings"
         with pytest.raises(InputError, match="'hand' is unknown; choose one of franka, none"):
             scene.order(gripper="hand")
+        with pytest.raises(InputError, match="risk: 2 is not a probability"):
+            scene.order(risk=2.0)
 
     def test_a_map_of_the_camera_is_none_of_the_gripper(self):
         reach = ReachabilityMap(np.full((8, 8, 8, 1), 255, np.uint8), -4.0 * np.ones(3), 1.0, 0.0, "camera")

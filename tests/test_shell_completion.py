@@ -56,7 +56,7 @@ def test_commands_options_values_and_files_are_completed(offered):
     assert offered("order", "rec") == {"recording"}
     assert offered("explore", "t") == offered("view", "t") == {"tower"}
     assert offered("explore", "tower", "--set", "fit.h") == {"fit.hypotheses="}
-    assert offered("session", "new", "s", "--set", "export.") == {"export.max_objects="} | {
+    assert offered("session", "new", "s", "--set", "export.") == {
         f"export.{name}=" for name in ("corners", "density", "frame", "friction")
     }
 

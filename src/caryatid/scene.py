@@ -264,7 +264,10 @@ class Scene(Pictured):
         if not self.graph.objects:
             raise InputError("scene", "has no views", "update it with a first view")
         rehearsal = self.config.rehearsal
-        rehearsal = rehearsal if risk is None else replace(rehearsal, risk=risk)
+        if risk is not None:
+            if not 0.0 <= risk <= 1.0:
+                raise InputError("risk", f"{risk:g} is not a probability", "give a number from 0 to 1")
+            rehearsal = replace(rehearsal, risk=risk)
         config = replace(self.config, gripper=gripper or self.config.gripper, rehearsal=rehearsal)
         order: Order = call(
             "order", self.graph, config, goal=goal, hands=hands, steps=steps, seed=self.seed,
