@@ -206,16 +206,6 @@ def test_a_principal_point_outside_the_image_is_said(sound):
     assert "K has its principal point at (-0, -0) in 320×240 pixels; is K for another resolution?" in problems
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e3, "millimetres"), (1e4, "tenths of a millimetre")])
-def test_of_depth_that_is_not_in_metres_no_view_is_made(sound, factor, unit):
-    said = f"as if in {unit}; give depth in metres: divide it by {factor:.0f}$"
-    with pytest.raises(ct.InputError, match=said):
-        ct.View(depth=factor * sound[0].depth, K=sound[0].K)
-    wild = sound[0].depth.copy()
-    wild[0, 0] = 500.0
-    assert ct.View(depth=wild, K=sound[0].K).valid[0, 0], "one reading is not all"
-
-
 def test_a_scene_refuses_what_no_pose_can_mend(sound):
     view = deep(lambda v: v.depth * ray_lengths(v))(sound[0])
     with pytest.raises(ct.InputError, match=r"along the ray of each pixel.*recording\.depth=ray"):

@@ -283,7 +283,7 @@ class TestGrasps:
         }
         tight = find_grasp(block, walls, JAW, 0.3)
         assert tight.by in (("o2",), ("o3",))
-        assert re.fullmatch(rf"{tight.by[0]} is in the way by at least 1\d mm", tight.why)
+        assert re.fullmatch(rf"{tight.by[0]} is in the way by 1\d mm", tight.why)
         assert isinstance(find_grasp(block, {"o2": walls["o2"]}, JAW, 0.3), Grasp)
         assert isinstance(find_grasp(block, walls, DISC, 0.3), Grasp)  # its tube is narrow
         wide = box((0.0, 0.0, TOP + 0.04), (0.1, 0.1, 0.08))

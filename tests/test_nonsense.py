@@ -44,7 +44,7 @@ def wrong_focal_lengths(view, rng):
 
 
 def scaled(view, rng):
-    return replace(view, depth=view.depth * np.float32(rng.choice([1e-3, 0.5, 0.7, 1.4, 2.0, 30.0])))
+    return replace(view, depth=view.depth * np.float32(rng.choice([1e-3, 0.5, 0.7, 1.4, 2.0, 1000.0])))
 
 
 def mirrored(view, _):

@@ -10,6 +10,7 @@ from contextlib import closing
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 from rich.progress import MofNCompleteColumn, Progress
 
@@ -63,6 +64,9 @@ from caryatid.viz.tables import (
     order_table,
     sentence,
 )
+
+REPORTED, LIFTS = 12, 3
+"""Numbers of objects up to which a run's report plans the whole order, and of lifts that it plans else."""
 
 
 def check_views(command: Check) -> int:
@@ -255,13 +259,16 @@ def write_report(
         about = [record.get("conditions"), made_by, record.get("date", "")[:16].replace("T", " ")]
         order, answer = None, describe_removed(record.get("lifts", ()))
         if run.graph.movable:
+            wanted = _find_wanted(run, config, asked)
             try:
-                order = _plan_order(run, config, asked)
+                order = orders.plan_order(run.graph, config, threads=cores(), **wanted)
                 answer += describe_order(order, run.graph)
             except GoalError:
                 raise
             except InputError as error:
                 answer += [f"No lift was rehearsed. {sentence(str(error))}"]
+            if order is not None and len(order.steps) == wanted["steps"]:
+                answer += [f"Only {wanted['steps']} lifts were planned; `caryatid order` plans all."]
         report = make_report(
             Path(record["source"]).name,
             read_steps(run),
@@ -282,17 +289,19 @@ def write_report(
     return list(files), answer
 
 
-def _plan_order(run: Run, config: Config, asked: Report | None) -> orders.Order:
-    """Plan what to remove after a run, as asked for, or as its command was; ignore a goal that is unknown."""
-    options, graph, seed = run.record["options"], run.graph, run.record["seed"]
+def _find_wanted(run: Run, config: Config, asked: Report | None) -> dict[str, Any]:
+    """Find what order a report is to have: as asked for, or as the run's command was, without a lost goal.
+
+    Unless asked, the order of a large scene is not planned to its end, which takes a minute and more.
+    """
+    options, graph = run.record["options"], run.graph
     goal, hands, reachable = run.record.get("goal") or options.get("goal"), options.get("hands", 1), None
     goal = None if goal is None else graph.find_id(goal)
     if asked is not None:
         goal, hands, reachable = asked.goal or goal, max(asked.hands, hands), asked.reachable(config)
-    return orders.plan_order(
-        graph, config, goal=goal, hands=hands, seed=seed, threads=cores(), reachable=reachable,
-        voxels=run.views[-1].load_step().voxels,
-    )  # fmt: skip
+    steps = None if asked is not None or len(graph.movable) <= REPORTED else LIFTS
+    known = {"goal": goal, "hands": hands, "reachable": reachable, "steps": steps, "seed": run.record["seed"]}
+    return known | {"voxels": run.views[-1].load_step().voxels}
 
 
 def compare_methods(command: Benchmark) -> None:

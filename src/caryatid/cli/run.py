@@ -133,6 +133,7 @@ def clear_table(command: Clear) -> int:
         camera, source.robot, planner=command.chosen_planner, config=config, masks=masks, **command.looking
     )
     with RunWriter(command.out, config, _about(command)) as writer:
+        writer.more |= {"goal": goal} if goal else {}
         lifts = RecordedLifts(writer, explorer, camera, config)
         steps = clear(
             explorer, lifts.take, goal=goal, hands=command.hands, threads=cores(), reachable=reachable
@@ -215,9 +216,9 @@ def _find_goal(command: Explore | Clear, source: Source, config: Config) -> str 
     if goal is None or others or config.fusion.masks != "scene" or not isinstance(camera, SimulatedCamera):
         return goal
     bodies = {object_id(label): body for label, body in camera.scene.object_bodies.items()}
-    for i, body in bodies.items():
-        if goal in (i, body):
-            return i
+    found = goal if goal in bodies else next((i for i in bodies if bodies[i] == goal), None)
+    if found is not None:
+        return found
     known = ", ".join(f"{i} ({body})" for i, body in bodies.items())
     remedy = f"{did_you_mean(goal, bodies.values())}known objects: {known}"
     raise GoalError(f"--goal {goal}", "is not an object", remedy)
@@ -235,7 +236,8 @@ def _conditions(command: Explore | Extract | Clear, first: Step) -> str:
     simulated, given = kind_of(command.source) == "scene", command.settings.masks_from
     text = "segments: automatic"
     if command.segmentation != "auto":
-        text = f"masks: {given or ('simulator' if simulated else 'of the source')}"
+        text = f"masks: {given or ('simulator' if simulated else 'from the source')}"
+        text += ", if any" * (first.view is None)  # A cloud's labels are not kept.
         if first.view is not None and first.view.labels is None:
             text = "segments: automatic, because the source has no masks"
     return text if isinstance(command, Extract) or not simulated else f"{text}, noise: {command.noise}"

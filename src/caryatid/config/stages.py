@@ -41,8 +41,9 @@ def _few_voxels(extent: tuple[float, float, float], info: ValidationInfo) -> tup
 Positive = Annotated[float, Field(gt=0, le=1e18)]
 NotNegative = Annotated[float, Field(ge=0, le=1e18)]
 Length = Annotated[float, Field(gt=0, le=1000)]
-HandSize = Annotated[float, Field(gt=0, le=1)]
 """A longer one is no room; in its square, that of the smallest error of depth would be rounded away."""
+HandSize = Annotated[float, Field(gt=0, le=1)]
+"""A length of a gripper [m]; a longer one is in millimetres."""
 Distance = Annotated[float, Field(ge=0, le=1000)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Likelihood = Annotated[float, Field(gt=0, lt=1)]

@@ -75,9 +75,12 @@ def find_grasp(
         reachable.check_use("reachable", "gripper", "world")
     jaw = gripper.kind == "parallel"
     sides = list(_antipodal(shape, gripper, friction) if jaw else _flat(shape, gripper))
-    found = [(T, width) for T, width in sides if width + 2.0 * gripper.clearance <= gripper.opening]
+    widest = gripper.opening - 2.0 * gripper.clearance if jaw else np.inf
+    found = [(T, width) for T, width in sides if width <= widest]
     if not sides:
-        return Blocked((), "no two sides are opposite" if jaw else "no side is flat enough")
+        return Blocked(
+            (), "no two opposite sides are within gripper.tilt" if jaw else "no side is flat enough"
+        )
     if not found:
         lengths = min(width for _, width in sides), gripper.opening, gripper.clearance
         side, opening, spare = (f"{1e3 * length:.0f} mm" for length in lengths)
@@ -126,7 +129,7 @@ def find_grasp(
             return Grasp(poses[k] @ turn, float(widths[k]), gripper.travel, free)
         fewest = by
     if fewest:
-        told = (f"{i} is in the way by at least {1e3 * distance:.0f} mm" for i, distance in fewest.items())
+        told = (f"{i} is in the way by {1e3 * distance:.0f} mm" for i, distance in fewest.items())
         return Blocked(tuple(fewest), ", ".join(told))
     if most >= 0.0:
         seen = f"at most {100.0 * most // 1.0:.0f}% of the gripper's way was seen to be free"

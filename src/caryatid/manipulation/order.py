@@ -65,7 +65,7 @@ class Order(Pictured):
         refusal: Why no order is safe, and which objects block each other; empty for a safe order.
         risk: Probability that any of the lifts moves another object, from the share of the rehearsals of all
             lifts in which one did [1].
-        unchecked: What was not checked, because it was not given; empty if all was.
+        unchecked: What was not checked; empty if all was.
         gripper: What lifts, as `Gripper.title`; empty if every object counts as graspable.
     """
 

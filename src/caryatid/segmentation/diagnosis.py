@@ -265,8 +265,9 @@ def check_camera(view: View, max_coordinate: float) -> None:
         remedy = f"give T_world_camera in metres, in a world whose origin is within {AWAY:g} m"
         raise WrongViewError(view.name, reason, remedy)
     if float(view.depth.max(initial=0.0)) > max_coordinate:
-        remedy = "give depth in metres, and 0 where there is no reading"
-        raise WrongViewError(view.name, f"depth reaches {view.depth.max():.4g} m", remedy)
+        unit = describe_unit(view.depth[view.valid])
+        reason = f"depth reaches {view.depth.max():.4g} m{unit}"
+        raise WrongViewError(view.name, reason, f"give depth in metres{undo_unit(unit)}")
 
 
 def describe_camera(view: View) -> str:

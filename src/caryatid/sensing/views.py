@@ -12,7 +12,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from caryatid.errors import InputError, WrongViewError, check_type
+from caryatid.errors import InputError, check_type
 from caryatid.geometry import points as kernels
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
@@ -70,7 +70,7 @@ class View(Pictured):
         names: What labels show, such as {3: "mug"}, or None; several may have one name.
 
     Raises:
-        InputError: Sizes differ, depth is negative, infinite or not in metres, K or the pose is not valid.
+        InputError: Sizes differ, depth is negative or infinite, K or the pose is not valid.
     """
 
     depth: NDArray[np.float32]
@@ -93,9 +93,6 @@ class View(Pictured):
         if np.isinf(depth).any() or (depth < 0.0).any():
             bad = "infinite" if np.isinf(depth).any() else "negative"
             raise InputError(name, f"depth contains {bad} values", "mark missing readings with 0 or NaN")
-        if depth.max() > AWAY and (far := float(np.median(depth[depth > 0.0]))) > AWAY:
-            reason = f"depth is about {far:.4g} m{(unit := describe_unit(depth[depth > 0.0]))}"
-            raise WrongViewError(name, reason, f"give depth in metres{undo_unit(unit)}")
         # Anything nearer than a micrometre is not a reading, and its inverse may be infinite.
         depth = np.where(depth < 1e-6, np.float32(0.0), depth)
         assign("depth", depth)
