@@ -152,6 +152,13 @@ def test_poses_wrong_one_by_one_are_no_common_turn(wrist, seed):
     assert not any("tables" in doubt for doubt in found.doubts)
 
 
+def test_a_view_with_a_wrong_pose_is_named(wrist):
+    bad = replace(wrist[2].with_pose(wrist[2].pose @ turned(12.0, 0.0, 0.0)), name="bad")
+    found = diagnose([*wrist[:2], bad, *wrist[3:]], Config())
+    (doubt,) = (doubt for doubt in found.doubts if "single poses" in doubt)
+    assert re.search(r": bad by 1[12]\.\d°$", doubt)
+
+
 def test_a_table_tilted_in_all_views_is_not_passed_over(sound):
     turn = transforms.rigid(transforms.rotation_from_vector(np.array([1.9, 0.0, 0.0])), np.zeros(3))
     assert diagnose([view.with_pose(turn @ view.pose) for view in sound], Config()).problems

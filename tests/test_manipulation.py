@@ -226,7 +226,7 @@ class TestOrder:
 
 JAW = GripperConfig(kind="parallel", opening=0.08)
 DISC = GripperConfig(kind="suction")
-TOO_WIDE = "does not fit the gripper's 80 mm less 2 × 5 mm"
+TOO_WIDE = "and the gripper takes 80 mm less 2 × 5 mm"
 
 
 def with_gripper(gripper):
@@ -287,7 +287,9 @@ class TestGrasps:
         assert isinstance(find_grasp(block, {"o2": walls["o2"]}, JAW, 0.3), Grasp)
         assert isinstance(find_grasp(block, walls, DISC, 0.3), Grasp)  # its tube is narrow
         wide = box((0.0, 0.0, TOP + 0.04), (0.1, 0.1, 0.08))
-        assert find_grasp(wide, {}, JAW, 0.3) == Blocked((), f"its narrowest side, 100 mm, {TOO_WIDE}")
+        assert find_grasp(wide, {}, JAW, 0.3) == Blocked(
+            (), f"no grip on it is narrower than 100 mm, {TOO_WIDE}"
+        )
         assert find_grasp(sphere((0.0, 0.0, TOP + 0.03), 0.03), {}, DISC, 0.3).why == "no side is flat enough"
 
     def test_unseen_space_and_the_arm_forbid_grasps(self):
@@ -317,12 +319,12 @@ class TestGrasps:
         assert not narrow.safe
         assert narrow.refusal == (
             "1 of 4 objects can be removed; "
-            f"o3 cannot be grasped: its narrowest side, 80 mm, {TOO_WIDE}; "
-            f"o2 cannot be grasped: its narrowest side, 100 mm, {TOO_WIDE}; "
-            f"o1 cannot be grasped: its narrowest side, 120 mm, {TOO_WIDE}"
+            f"o3 cannot be grasped: no grip on it is narrower than 80 mm, {TOO_WIDE}; "
+            f"o2 cannot be grasped: no grip on it is narrower than 100 mm, {TOO_WIDE}; "
+            f"o1 cannot be grasped: no grip on it is narrower than 120 mm, {TOO_WIDE}"
         )
         below = plan_order(tower(), with_gripper(JAW), goal="o1")
-        assert below.refusal == f"o1 cannot be grasped: its narrowest side, 120 mm, {TOO_WIDE}"
+        assert below.refusal == f"o1 cannot be grasped: no grip on it is narrower than 120 mm, {TOO_WIDE}"
 
     def test_an_order_says_that_what_lies_on_an_unsafe_lift_cannot_be_grasped(self):
         table = graph_of(
@@ -332,7 +334,7 @@ class TestGrasps:
         assert [(s.object_id, s.safe) for s in order.steps] == [("o1", False)]
         assert order.refusal == (
             "no safe order: lifting o1 disturbs o2; "
-            f"o2 cannot be grasped: its narrowest side, 100 mm, {TOO_WIDE}"
+            f"o2 cannot be grasped: no grip on it is narrower than 100 mm, {TOO_WIDE}"
         )
 
     def test_a_scene_plans_an_order_for_a_gripper_by_name(self):
@@ -344,7 +346,7 @@ class TestGrasps:
         closing = known.grasp.T_world_gripper[:3, 1]
         assert abs(closing[0]) == pytest.approx(1.0), "panda_hand_tcp closes along y, here on 6 cm"
         scene.config = with_gripper(replace(JAW, opening=0.03))
-        assert "gripper's 30 mm" in scene.order(gripper="parallel").refusal, "a kind keeps the settings"
+        assert "gripper takes 30 mm" in scene.order(gripper="parallel").refusal, "a kind keeps the settings"
         with pytest.raises(InputError, match="'hand' is unknown; choose one of franka, none"):
             scene.order(gripper="hand")
         with pytest.raises(InputError, match="risk: 2 is not a probability"):

@@ -414,10 +414,11 @@ def test_each_object_is_drawn_over_its_own_support_surface():
 def test_several_support_surfaces_are_named_and_one_is_the_table(make_step):
     graph, levels = make_graph(), shelf_graph()
     assert census(levels) == "6 objects on 3 support surfaces, 6 supports"
-    (found,) = changes(None, replace(make_step(0), graph=levels))
-    assert "o1 (box) supported by o0, o2 (cylinder) supported by o1, o3 (box) supported by s1" in found
-    (found,) = changes(None, replace(make_step(0), graph=graph))
-    assert "o1 (box) supported by the table and o2?, o2" in found
+    (found,) = changes(None, replace(make_step(0), graph=levels)).values()
+    held = ["o1 (box) supported by o0", "o2 (cylinder) supported by o1", "o3 (box) supported by s1"]
+    assert found[:3] == held
+    (found,) = changes(None, replace(make_step(0), graph=graph)).values()
+    assert found[0] == "o1 (box) supported by the table and o2?"
     tags = re.findall(r">(\w+)</text>", picture_svg(draw_cloud(make_cloud(levels), levels, 0.0)))
     assert sorted(tags) == sorted(levels)
 

@@ -333,7 +333,7 @@ class Explorer:
             self.step = replace(step, removal=removal)
         return self._newest()
 
-    def conclude(self, step: Step) -> Step:
+    def conclude_step(self, step: Step) -> Step:
         """Add to the last step what only it tells: why each object has its shape, and free space."""
         return replace(step, reasons=self.scene.reasons(), voxels=self.scene.voxels)
 
@@ -480,7 +480,7 @@ def explore(
             for late in explorer.finish():
                 yield late
                 step = replace(late, stop=step.stop)
-            step = explorer.conclude(step)
+            step = explorer.conclude_step(step)
             lost = goal is not None and step.graph.find_id(goal) is None
             yield replace(step, stop=f"{step.stop}; {goal} was not found") if lost else step
             return

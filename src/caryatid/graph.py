@@ -148,7 +148,7 @@ class SupportGraph(Pictured):
         for candidate in self.objects:
             if candidate.id == object_id:
                 return candidate
-        raise KeyError(f"unknown object '{word}'; {self.suggest(word)}")
+        raise KeyError(f"unknown object '{word}'; {self.suggest_objects(word)}")
 
     def __contains__(self, object_id: object) -> bool:
         return any(o.id == object_id for o in self.objects)
@@ -172,7 +172,7 @@ class SupportGraph(Pictured):
             raise GoalError(word, "is the name of several objects", f"give the id: {', '.join(ids)}")
         return ids[0] if ids else None
 
-    def suggest(self, word: str) -> str:
+    def suggest_objects(self, word: str) -> str:
         """Say what a word that is no object's id or name may mean, and list the objects, as a remedy."""
         meant = did_you_mean(word, [o.name for o in self.movable if o.name is not None])
         return f"{meant}known objects: {', '.join(o.title for o in self.movable) or 'none'}"

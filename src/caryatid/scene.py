@@ -33,7 +33,7 @@ from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
 from caryatid.objects.reasons import Reasons
 from caryatid.runtime import Pictured, call
-from caryatid.runtime.parallel import check_budget, compile_time, cores, in_background, one_blas_thread
+from caryatid.runtime.parallel import check_budget, cores, in_background, one_blas_thread, read_compile_time
 from caryatid.segmentation.diagnosis import (
     check_camera,
     check_depth,
@@ -402,7 +402,7 @@ class Scene(Pictured):
         for o in self.graph.objects:
             if o.id == self.graph.find_id(object_id) and o.role == "object":
                 return o
-        raise InputError(object_id, "is not an object of the graph", self.graph.suggest(object_id))
+        raise InputError(object_id, "is not an object of the graph", self.graph.suggest_objects(object_id))
 
     def _labels(self) -> set[int]:
         """Labels of the objects, in the models and in the graph."""
@@ -967,11 +967,11 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}
-        self._started = perf_counter(), compile_time()
+        self._started = perf_counter(), read_compile_time()
 
     def lap(self, stage: str) -> None:
         """End a stage and start the next one."""
-        (started, before), self._started = self._started, (perf_counter(), compile_time())
+        (started, before), self._started = self._started, (perf_counter(), read_compile_time())
         whole = self._started[0] - started
         compiling = min(self._started[1] - before, whole)  # Other threads compile too.
         self.laps[stage] = self.laps.get(stage, 0.0) + whole - compiling

@@ -91,6 +91,20 @@ class Model(NamedTuple):
     space: VoxelMap | None
 
 
+def read_known_graph(path: Path) -> SupportGraph:
+    """Read the graph of a run, a session, or a graph.json.
+
+    Raises:
+        InputError: It is none of these, or the file is missing or broken.
+    """
+    if path.is_file():
+        return read_graph(path)
+    if not is_session(path):
+        return read_run(path).graph
+    with Session.open(path, read_only=True) as session:
+        return session.graph
+
+
 def read_model(path: Path) -> Model:
     """Read the model of a run, a session, or a graph.json, which has no more than its graph.
 
@@ -104,7 +118,7 @@ def read_model(path: Path) -> Model:
         return Model(run.graph, read_config(run), run.record["seed"], run.views[-1].load_step().voxels)
     with Session.open(path, read_only=True) as session:
         scene = session.scene
-        return Model(session.graph, scene.config, scene.seed, scene.voxels)
+        return Model(scene.graph, scene.config, scene.seed, scene.voxels)
 
 
 def read_scene(path: Path) -> Scene:
@@ -331,18 +345,23 @@ def _viewable(source: str) -> Kind:
 
 def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:
     """The steps of all views, or the error of the last if none shows a support surface."""
+    newest = None
     for left, frame in zip(range(len(recording))[::-1], recording.frames, strict=True):
         try:
             for step in explorer.looks(frame.load()):
-                yield step if left else explorer.conclude(step)
+                if newest is not None:
+                    yield newest
+                newest = step
         except NoSurfaceError as error:
             if not left:
                 raise
             log.warning(KEPT, error)
         except (WrongViewError, PerceptionError) as error:
-            if explorer.step is None:
+            if newest is None:
                 raise
             log.warning(LEFT_OUT, error)
+    if newest is not None:
+        yield explorer.conclude_step(newest)
 
 
 def _check_segments(source: str, points: Mapping[int, int], config: Config) -> None:

@@ -59,8 +59,6 @@ class RunWriter(StagedFolder):
     error leaves nothing behind. An earlier run folder is replaced only when this one appears. A folder with
     other files is never changed.
 
-    A run is what its run.json says, which is written last: what a kill leaves beside it does not count.
-
     Args:
         folder: RUN.
         config: All settings.
@@ -276,7 +274,7 @@ def read_run(folder: str | Path) -> Run:
     if file.scores and len(file.scores) != file.views:
         raise InputError(path, f"the number of scores, {len(file.scores)}, is not that of views", AGAIN)
     views = tuple(RunView(folder / _view_folder(index)) for index in range(file.views))
-    return Run(folder, record, views[-1].graph, views)  # graph.json may be newer than run.json after a kill
+    return Run(folder, record, views[-1].graph, views)
 
 
 def read_steps(run: Run) -> Iterator[Step]:

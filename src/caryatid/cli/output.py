@@ -86,9 +86,8 @@ class Output(logging.Handler):
         self.say(f"view {step.index + 1}{when}: {census(step.graph)}{f1} ({turn(step.timings):.1f} s{once})")
         for change in noticed(before, step):
             self.say(f"  {change}")
-        for line in changes(before, step):
-            kind, _, items = line.partition(": ")
-            self.say(f"  {kind}: " + items.replace(", ", "\n" + " " * (len(kind) + 4)))
+        for kind, items in changes(before, step).items():
+            self.say(f"  {kind}: " + ("\n" + " " * (len(kind) + 4)).join(items))
         if step.removal is not None:
             self.say(f"  without {step.removal.object_id}: {step.removal}")
         if lift is not None:

@@ -50,7 +50,7 @@ from caryatid.runtime.parallel import cores
 from caryatid.segmentation.diagnosis import diagnose
 from caryatid.sessions.session import is_session
 from caryatid.simulation.warm_up import is_warm
-from caryatid.sources import kind_of, open_run, read_model, read_scene
+from caryatid.sources import kind_of, open_run, read_known_graph, read_model, read_scene
 from caryatid.steps import Run, read_config, read_run, read_steps
 from caryatid.viz.check_report import SHOWN, make_check_report
 from caryatid.viz.report import find_chromium, make_report, print_pdf, read_lift, render_html
@@ -199,14 +199,14 @@ def export_model(command: Export) -> None:
         command.output.say(f"{out}: {count_of(len(run.views), 'view')}")
         return
     format_ = format_of(out, command.format)
-    graph = read_model(command.run).graph
+    graph = read_known_graph(command.run)
     export_graph(graph, out, config.export)
     command.output.result({"file": str(out), "format": format_}, "")
     command.output.say(f"{out}: {format_}, {census(graph)}")
 
 
 def describe_model(command: Describe) -> None:
-    text = describe(read_model(command.run).graph)
+    text = describe(read_known_graph(command.run))
     command.output.result({"text": text}, text)
 
 
@@ -259,7 +259,7 @@ def write_report(
         about = [record.get("conditions"), made_by, record.get("date", "")[:16].replace("T", " ")]
         order, answer = None, describe_removed(record.get("lifts", ()))
         if run.graph.movable:
-            wanted = _find_wanted(run, config, asked)
+            wanted = _choose_options(run, config, asked)
             try:
                 order = orders.plan_order(run.graph, config, threads=cores(), **wanted)
                 answer += describe_order(order, run.graph)
@@ -289,7 +289,7 @@ def write_report(
     return list(files), answer
 
 
-def _find_wanted(run: Run, config: Config, asked: Report | None) -> dict[str, Any]:
+def _choose_options(run: Run, config: Config, asked: Report | None) -> dict[str, Any]:
     """Find what order a report is to have: as asked for, or as the run's command was, without a lost goal.
 
     Unless asked, the order of a large scene is not planned to its end, which takes a minute and more.

@@ -228,7 +228,7 @@ def _check_found(goal: str | None, last: Step) -> None:
     """Reject a goal that the last graph lacks."""
     if goal is not None and last.graph.find_id(goal) is None:
         reason = f"was not found in {count_of(last.index + 1, 'view')}"
-        raise GoalError(f"--goal {goal}", reason, last.graph.suggest(goal))
+        raise GoalError(f"--goal {goal}", reason, last.graph.suggest_objects(goal))
 
 
 def _conditions(command: Explore | Extract | Clear, first: Step) -> str:

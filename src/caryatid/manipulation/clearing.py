@@ -83,7 +83,7 @@ def clear(
         if reason is not None:
             # No further view shows what is left.
             last = replace(step, graph=explorer.scene.graph, candidates=None, decision=None, stop=reason)
-            step = explorer.conclude(last)
+            step = explorer.conclude_step(last)
         explorer.step = step
         yield step
 

@@ -84,8 +84,8 @@ def find_grasp(
     if not found:
         lengths = min(width for _, width in sides), gripper.opening, gripper.clearance
         side, opening, spare = (f"{1e3 * length:.0f} mm" for length in lengths)
-        fit = f"does not fit the gripper's {opening} less 2 × {spare}"
-        return Blocked((), f"its narrowest side, {side}, {fit}")
+        fit = f"the gripper takes {opening} less 2 × {spare}"
+        return Blocked((), f"no grip on it is narrower than {side}, and {fit}")
     poses, widths = np.array([T for T, _ in found]), np.array([width for _, width in found])
     turn = turn_of(gripper)
     if reachable is not None:
@@ -109,17 +109,18 @@ def find_grasp(
         # The heights [m] of the lift that the approach does not cover, 1 cm apart.
         top = 0.0 if -poses[k, 2, 2] > 1.0 - 1e-6 else gripper.travel + 1e-9
         path = np.concatenate([swept, *(risen + [0.0, 0.0, h] for h in np.arange(0.01, top, 0.01))])
-        if (shape.signed_distance(swept) < 0.0).any():
+        if ((own := shape.signed_distance(swept)) < 0.0).any():
             continue
-        missing = {i: gripper.clearance - float(o.signed_distance(path).min()) for i, o in near.items()}
+        distances = {i: o.signed_distance(path) for i, o in near.items()}
+        missing = {i: gripper.clearance - float(distance.min()) for i, distance in distances.items()}
         by = {i: distance for i, distance in missing.items() if distance > 0.0}
         if by and fewest and len(by) >= len(fewest):
             continue
         free = None
         if voxels is not None:
             # Next to known surfaces, their shapes decide: readings fill the voxels there.
-            known = (shape, *near.values(), *removed)
-            away = np.min([o.signed_distance(swept) for o in known], axis=0)
+            known = [own, *(distance[: len(swept)] for distance in distances.values())]
+            away = np.min([*known, *(o.signed_distance(swept) for o in removed)], axis=0)
             asked = swept[away > np.sqrt(3.0) * voxels.config.size]
             free = float((voxels.state_at(asked) == FREE).mean()) if len(asked) else 1.0
             if free < gripper.seen:

@@ -136,7 +136,7 @@ def plan_order(
     config = config or Config()
     rehearsal = _Rehearsal(graph, config, seed, threads, voxels, reachable)
     if named is not None and goal not in rehearsal.ids:
-        raise GoalError(named, "is not an object of the graph", graph.suggest(named))
+        raise GoalError(named, "is not an object of the graph", graph.suggest_objects(named))
     found: list[TakeStep] = []
     refusal = ""
     while len(found) != steps and (left := rehearsal.left()) and (goal is None or goal in left):
@@ -151,14 +151,14 @@ def plan_order(
             refusal = "; ".join([_refusal(trial, tried), *_out_of_grasp(rehearsal, wanted)])
         found.append(_step(rehearsal, trial, left))
         rehearsal.take(trial)
-    gripper, unchecked = config.gripper.title, ""
+    gripper, unchecked = config.gripper.title, list[str]()
     if not gripper:
-        unchecked = "whether a gripper can grasp the objects, because none is given"
+        unchecked.append("whether a gripper can grasp the objects, because none is given")
     elif voxels is None:
-        unchecked = "whether the gripper's path was seen to be free, because it is not known which space was"
-    elif any(step.hold for step in found):
-        unchecked = "whether the other hand can grasp what it holds"
-    return Order(tuple(found), refusal, rehearsal.risk, unchecked, gripper)
+        unchecked.append("whether the gripper's path was seen to be free, because no view is kept")
+    if gripper and any(step.hold for step in found):
+        unchecked.append("whether the other hand can grasp what it holds")
+    return Order(tuple(found), refusal, rehearsal.risk, "; ".join(unchecked), gripper)
 
 
 def _in_turn(rehearsal: _Rehearsal) -> list[str]:

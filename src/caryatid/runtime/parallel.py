@@ -40,7 +40,7 @@ _compiling = TimingListener()
 register("numba:compile", _compiling)
 
 
-def compile_time() -> float:
+def read_compile_time() -> float:
     """Time in which kernels were compiled since the program started [s]."""
     return float(_compiling.duration) if _compiling.done else 0.0
 

@@ -22,8 +22,11 @@ from caryatid.config.stages import Config
 from caryatid.errors import WrongViewError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import UP, Array
-from caryatid.sensing.views import AWAY, DEPTH_UNITS, View, describe_unit, undo_factor, undo_unit
+from caryatid.sensing.views import View
 
+AWAY = 100.0
+"""Distance of a camera from the world's origin beyond which its pose is not in metres [m]: no room is larger,
+and a camera farther than 10 cm from the origin is beyond it in millimetres."""
 SAMPLES, TRIALS = 1500, 200
 """Numbers of pixels at which planes are looked for, and of triples that are tried [1]: 200 find a plane of a
 quarter of the pixels with confidence 0.96."""
@@ -96,6 +99,23 @@ def _transpose_rotation(T: Array) -> Array:
     return transforms.rigid(T[:3, :3].T, T[:3, 3])
 
 
+def describe_unit(readings: NDArray[np.floating]) -> str:
+    """Say in which other unit readings (N,) would be about a metre, as of a table; else ""."""
+    median, counts = float(np.median(readings)), {"": 1.0, **DEPTH_UNITS}
+    unit = min(counts, key=lambda name: abs(np.log(median / counts[name])))
+    return f", as if in {unit}" if unit else ""
+
+
+def undo_unit(unit: str) -> str:
+    """Say how to convert readings that `describe_unit` says something of to metres."""
+    return "".join(f": {undo_factor(k)}" for name, k in DEPTH_UNITS.items() if unit.endswith(name))
+
+
+def undo_factor(factor: float) -> str:
+    """Say what undoes a factor."""
+    return f"divide it by {factor:.5g}" if factor > 1.0 else f"multiply it by {1.0 / factor:.5g}"
+
+
 def _scale_translation(T: Array, factor: float) -> Array:
     return transforms.rigid(T[:3, :3], factor * T[:3, 3])
 
@@ -152,6 +172,10 @@ POSES: Mapping[str, Callable[[Array], Array]] = {
 """Combinations of them."""
 LIKELY = {*WAYS, *CAMERAS, *WORLDS, *(cause for cause in POSES if GL_AXES in cause)}
 """Those that the table alone may tell; of many, some fit by chance."""
+DEPTH_UNITS: Mapping[str, float] = {
+    "millimetres": 1e3, "centimetres": 1e2, "tenths of a millimetre": 1e4, "kilometres": 1e-3,
+}  # fmt: skip
+"""How many of the units that depth is met in make a metre [1]."""
 UNITS: Mapping[str, float] = {
     f"the translation of T_world_camera is {1.0 / factor:.4g} times as long as depth says{unit}: "
     f"{undo_factor(1.0 / factor)}, if depth is right": factor
@@ -552,8 +576,10 @@ def diagnose(views: Iterable[View], config: Config) -> Diagnosis:
         elif shares[""] < LARGE:
             shared = f"{shares['']:.0%} of what they show above their largest planes"
             doubts.append(f"poses, because consecutive views share only {shared}")
-        # Registration can mend single poses, but not what all have in common.
-        doubts += [f"level tables: {cause}"] * (angle >= 2.0 * config.registration.rotation)
+        if not cause and (strays := _list_strays(thin, config.registration.rotation)):
+            doubts.append(f"single poses, because tables are tilted against those of most views: {strays}")
+        # Registration can mend small errors of single poses, but not what all have in common.
+        doubts += [f"level tables, because {cause}"] * (angle >= 2.0 * config.registration.rotation)
     # What is wrong may hide the rest.
     return Diagnosis(rows, list(usual.values()), [] if usual else doubts)
 
@@ -603,7 +629,7 @@ def _explain_tilts(views: Sequence[View], sigma: float) -> tuple[str, float, boo
     by, tilt = np.degrees([turn.magnitude(), transforms.angle_between(mean, UP)]).tolist()
     vector = ", ".join(f"{x:.1f}" for x in turn.as_rotvec(degrees=True))
     lost = ", perhaps forgotten or inverted" * (by > STEEP)
-    mended = f", or turn it on the right by Rotation.from_rotvec([{vector}], degrees=True)" * known
+    mended = f", or multiply poses on the right by Rotation.from_rotvec([{vector}], degrees=True)" * known
     causes = [
         f"all poses are off by the same turn of the camera, {'' if known else 'at least '}{by:.1f}°: the "
         f"hand-eye calibration is wrong{lost}: calibrate again{mended}"
@@ -614,8 +640,20 @@ def _explain_tilts(views: Sequence[View], sigma: float) -> tuple[str, float, boo
     return ", or ".join(causes), by if mount or focal else tilt, not (mount or focal)
 
 
+def _list_strays(views: Sequence[View], sigma: float) -> str:
+    """List the views whose table is tilted against the others', by more than noise sigma [deg] can."""
+    tables = [(view, plane) for view in views if (plane := find_image_plane(view)).share >= LARGE]
+    if len(tables) < 3:
+        return ""
+    normals = np.array([transforms.rotate(view.pose, plane.normal_camera(view.K)) for view, plane in tables])
+    away = np.degrees(transforms.angle_between(normals, np.median(normals, axis=0)))
+    strays = zip(tables, away.tolist(), strict=True)
+    far = np.sqrt(SURE) * sigma
+    return ", ".join(f"{view.name} by {angle:.1f}°" for (view, _), angle in strays if far < angle < STEEP)
+
+
 def _find_turn(vectors: Array, others: Array, sigma: float) -> tuple[Rotation, bool]:
-    """Find the rotation of vectors (N, 3) onto others, noise [rad], that fits most; is all of it known?
+    """Find the rotation of vectors (N, 3) onto others, noise [rad], that fits best, and whether all is known.
 
     Vectors that are alike do not tell the turn about them: the least turn that fits is taken.
     """

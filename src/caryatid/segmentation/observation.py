@@ -15,7 +15,7 @@ from caryatid.errors import InputError, NoSurfaceError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import UP, Array
 from caryatid.runtime.parallel import SHARES, for_each, kernel
-from caryatid.segmentation.diagnosis import name_causes
+from caryatid.segmentation.diagnosis import describe_unit, name_causes
 from caryatid.segmentation.foreground import find_bodies, find_foreground, find_furniture
 from caryatid.segmentation.samples import Labels
 from caryatid.segmentation.seams import Pairs
@@ -23,7 +23,7 @@ from caryatid.segmentation.segments import PLAIN, SMALLEST, colour_shares, segme
 from caryatid.segmentation.support_plane import SupportSurface, find_support_surfaces, find_surface_below
 from caryatid.segmentation.void import VOID, is_void
 from caryatid.sensing.clouds import average_pixels, oriented_points, slope_limit, thin, working_distance
-from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View, describe_unit
+from caryatid.sensing.views import MAX_LABEL, SUPPORT_LABEL, Cloud, View
 
 FRINGE = 2
 """Width of an object's fringe in the colour of what lies behind, in pixels of a resampled view [px]; half a

@@ -24,30 +24,6 @@ SUPPORT_LABEL = 65535
 """The label of the main support surface in label images: the last of 16 bits, so that given labels stay."""
 MAX_LABEL = 65519
 """The highest label of an object; those above are of support surfaces, at most 16, downwards from 65535."""
-AWAY = 100.0
-"""What is farther is not in metres [m]: no room is larger, and depth and cameras farther than 10 cm from the
-world's origin are beyond it in millimetres."""
-DEPTH_UNITS: Mapping[str, float] = {
-    "millimetres": 1e3, "centimetres": 1e2, "tenths of a millimetre": 1e4, "kilometres": 1e-3,
-}  # fmt: skip
-"""How many of the units that depth is met in make a metre [1]."""
-
-
-def describe_unit(readings: NDArray[np.floating]) -> str:
-    """Say in which other unit readings (N,) would be about a metre, as of a table; else ""."""
-    median, counts = float(np.median(readings)), {"": 1.0, **DEPTH_UNITS}
-    unit = min(counts, key=lambda name: abs(np.log(median / counts[name])))
-    return f", as if in {unit}" if unit else ""
-
-
-def undo_unit(unit: str) -> str:
-    """Say how to convert readings that `describe_unit` says something of to metres."""
-    return "".join(f": {undo_factor(k)}" for name, k in DEPTH_UNITS.items() if unit.endswith(name))
-
-
-def undo_factor(factor: float) -> str:
-    """Say what undoes a factor."""
-    return f"divide it by {factor:.5g}" if factor > 1.0 else f"multiply it by {1.0 / factor:.5g}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -453,7 +453,7 @@ class Session:
             raise InputError(self.path, "no view shows a table top yet", "add one that does")
         reported = "; ".join(str(change) for change in scene.changes if change.view == scene.views)
         stop = f"after the last view, {reported}" if reported else None
-        yield explorer.conclude(replace(newest, graph=scene.graph, cloud=scene.cloud, stop=stop))
+        yield explorer.conclude_step(replace(newest, graph=scene.graph, cloud=scene.cloud, stop=stop))
 
     def undo(self) -> int:
         """Undo the last view, or the last report after it, and return the number of views left.

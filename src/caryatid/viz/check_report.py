@@ -58,7 +58,9 @@ def make_check_report(
     wrong = [("Wrong", sentence(problem)) for problem in found.problems]
     answer = f"{count_of(len(wrong), 'fault')} in {count_of(len(found.views), 'view')}."
     doubts = [("Not confirmed", sentence(doubt)) for doubt in found.doubts]
-    sections = [Section("Answer", answer if wrong else "No fault was found.", facts=wrong + doubts)]
+    if not wrong:
+        answer = "No fault is certain, but not all is confirmed." if doubts else "No fault was found."
+    sections = [Section("Answer", answer, facts=wrong + doubts)]
     sections += [Section("World", TOGETHER, together)] if together else []
     sections += [Section("Images", "The largest plane is tinted.", figures)]
     sections.append(Section("Numbers", tables=[table]))

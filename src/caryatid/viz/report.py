@@ -171,7 +171,9 @@ def make_report(
     for number, step in enumerate(steps):
         f1 = f"F1 {scores[number]['f1']:.3f}" if number < len(scores) else ""
         before = seen[-1] if seen else None
-        news = "" if before is None else "; ".join(changes(before, step)) or "no change"
+        lines = {} if before is None else changes(before, step)
+        news = "; ".join(f"{kind}: {', '.join(items)}" for kind, items in lines.items())
+        news = news or ("" if before is None else "no change")
         told = [(f"Before view {step.index + 1}", str(change)) for change in noticed(before, step)]
         happened += told
         views.append(_view(step, news, f1, width, told))

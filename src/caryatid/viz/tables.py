@@ -296,8 +296,8 @@ def happenings(before: Step | None, step: Step) -> list[tuple[str, str]]:
     return told
 
 
-def changes(before: Step | None, step: Step) -> list[str]:
-    """List the changes of a view: one line each for objects found, changed, and gone.
+def changes(before: Step | None, step: Step) -> dict[str, list[str]]:
+    """List the changes of a view: the objects found, changed (`now`), and gone, where there are any.
 
     Those that were lifted, or `noticed` as removed, are not listed as gone.
     """
@@ -310,7 +310,7 @@ def changes(before: Step | None, step: Step) -> list[str]:
         "now": [text for id_, text in now.items() if known.get(id_, text) != text],
         "gone": [names[id_] for id_ in known if id_ not in now and id_ not in told],
     }
-    return [f"{kind}: {', '.join(items)}" for kind, items in lines.items() if items]
+    return {kind: items for kind, items in lines.items() if items}
 
 
 def _supported(graph: SupportGraph) -> dict[str, str]:
